@@ -1,0 +1,175 @@
+"""Containers and contracts that every floor shares."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
+
+type Metrics = dict[str, Float[Array, ""]]
+"""Scalars on the device, named ``group/name``."""
+
+type ArrayLike = Any
+"""A NumPy or JAX array: the goal task is written for both."""
+
+
+class ConfigurationError(ValueError):
+    """A name, value or folder that the user gave cannot be used; its text is one clear line."""
+
+
+class NonFiniteError(RuntimeError):
+    """A loss or value became NaN or infinite; its text names the quantity."""
+
+
+class GoalTask(Protocol):
+    """The one definition of success, shared by collection, replay, evaluation and tests."""
+
+    def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
+        """Return reward ``(B,)`` float32 and terminated ``(B,)`` bool of goals ``(B, goal_dim)``."""
+        ...
+
+    def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
+        """Return the distance to the goal ``(B,)`` that success is measured by."""
+        ...
+
+
+@dataclass(frozen=True)
+class DistanceTask:
+    """Reward -1 on every step; terminated when every group of coordinates is near its goal.
+
+    Attributes:
+        groups: Indices of the coordinates of each Euclidean distance, such as ``((0, 1),)`` for
+            the x-y position of an ant or ``((0, 1), (2, 3))`` for hand and puck.
+        threshold: Largest distance, not included, that counts as success (m).
+    """
+
+    groups: tuple[tuple[int, ...], ...]
+    threshold: float
+
+    def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
+        """Return the largest of the groups' distances ``(B,)`` (m)."""
+        difference = achieved - desired
+        distances = [
+            sum(difference[..., i] ** 2 for i in group) ** 0.5  # type: ignore[operator]
+            for group in self.groups
+        ]
+        largest = distances[0]
+        for other in distances[1:]:
+            largest = largest * (largest >= other) + other * (other > largest)
+        return largest
+
+    def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
+        """Return reward ``(B,)``, always -1, and terminated ``(B,)``."""
+        distance = self.distance(achieved, desired)
+        return (0 * distance - 1).astype("float32"), distance < self.threshold
+
+
+@dataclass(frozen=True)
+class EnvSpec:
+    """What agents and replay may know of an environment.
+
+    Attributes:
+        name: The name that users type, such as ``ant-u``.
+        observation_shape: Shape of one observation.
+        observation_dtype: ``float32``, or ``uint8`` for images.
+        goal_shape: Shape of one achieved or desired goal.
+        action_dim: Number of actions, each in [-1, 1].
+        max_episode_steps: Steps after which an episode is truncated.
+        goal_is_observation: Whether the achieved goal is the observation itself (the paper's case).
+        state_shape: Shape of ``achieved_state`` where success is measured on a state that the
+            networks never see; ``None`` where it is measured on the goals.
+        task: The definition of success.
+    """
+
+    name: str
+    observation_shape: tuple[int, ...]
+    observation_dtype: str
+    goal_shape: tuple[int, ...]
+    action_dim: int
+    max_episode_steps: int
+    goal_is_observation: bool
+    state_shape: tuple[int, ...] | None
+    task: GoalTask
+
+    @property
+    def is_image(self) -> bool:
+        """Whether observations and goals are images."""
+        return len(self.observation_shape) == 3
+
+
+class Subgoal(NamedTuple):
+    """A state in both of its roles: one that is reached, and one that is started from.
+
+    Where the goal is the observation itself, both are the same array.
+    """
+
+    observation: Shaped[Array, "B ..."]
+    achieved_goal: Shaped[Array, "B ..."]
+
+
+class Batch(NamedTuple):
+    """Relabelled transitions; reward and terminated belong to ``goal``."""
+
+    observation: Shaped[Array, "B ..."]
+    action: Float[Array, "B action_dim"]
+    reward: Float[Array, " B"]
+    terminated: Bool[Array, " B"]
+    next_observation: Shaped[Array, "B ..."]
+    goal: Shaped[Array, "B ..."]
+    subgoal_candidate: Subgoal
+
+
+@dataclass(frozen=True)
+class RelabelMix:
+    """Shares of a batch by the source of its goals (appendix B, experience relabelling).
+
+    Attributes:
+        own: Goal that the episode was collected with.
+        random: Achieved goal of a random state of the replay.
+        future: Achieved goal of a later state of the same episode.
+    """
+
+    own: float = 0.2
+    random: float = 0.4
+    future: float = 0.4
+
+    def __post_init__(self) -> None:
+        """Check the shares.
+
+        Raises:
+            ConfigurationError: A share is negative or their sum is not 1.
+        """
+        shares = (self.own, self.random, self.future)
+        if min(shares) < 0 or abs(sum(shares) - 1) > 1e-6:
+            raise ConfigurationError(
+                f"relabel mix {shares}: the shares (own, random, future) must be >= 0 and add to 1"
+            )
+
+
+class Agent[Config, State](Protocol):
+    """An algorithm as pure functions; it never sees an environment, a logger or a file."""
+
+    def create(self, config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
+        """Return networks and optimisers at their start."""
+        ...
+
+    def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
+        """Return the state after one gradient step of every network, and scalars to log."""
+        ...
+
+    def act(
+        self,
+        state: State,
+        observation: Shaped[Array, "B ..."],
+        goal: Shaped[Array, "B ..."],
+        key: Key[Array, ""],
+        explore: bool,
+    ) -> Float[Array, "B action_dim"]:
+        """Return actions in [-1, 1]: sampled where ``explore``, else the tanh of the mean."""
+        ...
+
+
+type Observation = Mapping[str, Any]
+"""Goal-environment dictionary: observation, achieved_goal, desired_goal (and the two states)."""
+
+type Index = Int[Array, " B"]
