@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar
 
-from jaxtyping import Array, Bool, Float, Int, Key, Shaped
+from jaxtyping import Array, Bool, Float, Key, Shaped
 
-type Metrics = dict[str, Float[Array, ""]]
+Metrics: TypeAlias = dict[str, Float[Array, ""]]
 """Scalars on the device, named ``group/name``."""
 
-type ArrayLike = Any
+ArrayLike: TypeAlias = Any
 """A NumPy or JAX array: the goal task is written for both."""
 
 
@@ -146,7 +146,11 @@ class RelabelMix:
             )
 
 
-class Agent[Config, State](Protocol):
+Config = TypeVar("Config", contravariant=True)
+State = TypeVar("State")
+
+
+class Agent(Protocol[Config, State]):
     """An algorithm as pure functions; it never sees an environment, a logger or a file."""
 
     def create(self, config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
@@ -169,7 +173,5 @@ class Agent[Config, State](Protocol):
         ...
 
 
-type Observation = Mapping[str, Any]
+Observation: TypeAlias = Mapping[str, Any]
 """Goal-environment dictionary: observation, achieved_goal, desired_goal (and the two states)."""
-
-type Index = Int[Array, " B"]
