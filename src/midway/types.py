@@ -25,7 +25,7 @@ class GoalTask(Protocol):
     """The one definition of success, shared by collection, replay, evaluation and tests."""
 
     def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
-        """Return reward ``(B,)`` float32 and terminated ``(B,)`` bool of goals ``(B, goal_dim)``."""
+        """Return reward ``(B,)`` float32, terminated ``(B,)`` bool for goals ``(B, goal_dim)``."""
         ...
 
     def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:

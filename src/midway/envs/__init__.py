@@ -1,0 +1,1 @@
+"""Native goal environments on batched MuJoCo, and the registry of all environments."""

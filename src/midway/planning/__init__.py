@@ -1,0 +1,1 @@
+"""Planners over learned models."""

@@ -1,0 +1,1 @@
+"""A ring of transitions on the learner's device, with hindsight relabelling."""

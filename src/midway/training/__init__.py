@@ -1,0 +1,1 @@
+"""The loop: collect, update, evaluate, log, checkpoint."""
