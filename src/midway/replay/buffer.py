@@ -1,0 +1,170 @@
+"""Replay as pure functions: create, begin, add, sample.
+
+All run on the learner's device inside compiled steps. Donate the replay to a compiled ``begin`` or
+``add``, and the ring is written in place.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from midway.replay.relabel import draw_states, draw_transitions, goal_rows
+from midway.replay.storage import (
+    ReplayState,
+    allocate,
+    episode_first,
+    insert,
+    live,
+    num_bytes,
+    read,
+    write,
+)
+from midway.types import Batch, ConfigurationError, EnvSpec, Observation, RelabelMix, Subgoal
+
+
+def create(spec: EnvSpec, capacity: int, num_lanes: int) -> ReplayState:
+    """Return an empty replay.
+
+    Args:
+        spec: The environment.
+        capacity: Rows over all lanes; an episode of T steps takes T + 2 rows.
+        num_lanes: Number of parallel environments K; each writes its own lane.
+
+    Raises:
+        ConfigurationError: A lane cannot hold two of the longest episodes.
+    """
+    _check(spec, capacity, num_lanes)
+    return allocate(_row_kinds(spec), num_lanes, capacity // num_lanes)
+
+
+def begin(replay: ReplayState, observation: Observation, mask: Bool[Any, " K"]) -> ReplayState:
+    """Start an episode in each masked lane from the observation ``(K, ...)`` of its reset.
+
+    Writes the goal row and the row of s_0. An episode in which no step was taken is overwritten.
+    """
+    mask = jnp.asarray(mask)
+    lane = jnp.arange(mask.shape[0])
+    newest = replay.num_episodes - 1
+    newest_first = episode_first(replay, lane, newest)
+    # Overwriting leaves every ended episode at least three rows: this bounds the episode table.
+    unused = (newest >= 0) & (replay.num_rows - newest_first == 2)
+    serial = jnp.where(unused, newest, newest + 1)
+    first = jnp.where(unused, newest_first, replay.num_rows)
+
+    replay = write(replay, first, _goal_row(replay, observation), mask)
+    replay = write(replay, first + 1, _state_row(replay, observation), mask)
+    episode = insert(replay.episode, first, serial, mask)
+    return replay._replace(
+        episode=insert(episode, first + 1, serial, mask),
+        first=insert(replay.first, serial, first, mask),
+        num_rows=jnp.where(mask, first + 2, replay.num_rows),
+        num_episodes=jnp.where(mask, serial + 1, replay.num_episodes),
+    )
+
+
+def add(
+    replay: ReplayState,
+    action: Float[Any, "K action_dim"],
+    observation: Observation,
+    mask: Bool[Any, " K"],
+) -> ReplayState:
+    """Append one step to the running episode of each masked lane.
+
+    The action goes into the lane's newest row, the observation ``(K, ...)`` after the step becomes
+    the next row. Lanes where no episode was begun are left alone.
+    """
+    mask = jnp.asarray(mask) & (replay.num_episodes > 0)
+    position = replay.num_rows
+    replay = write(replay, position - 1, {"action": action}, mask)
+    replay = write(replay, position, _state_row(replay, observation), mask)
+    return replay._replace(
+        episode=insert(replay.episode, position, replay.num_episodes - 1, mask),
+        num_rows=position + mask,
+    )
+
+
+def sample(
+    replay: ReplayState, spec: EnvSpec, mix: RelabelMix, batch_size: int, key: Key[Array, ""]
+) -> Batch:
+    """Return transitions drawn uniformly, with relabelled goals, and states as subgoal candidates.
+
+    Reward and terminated are both recomputed for the new goal (appendix B, experience relabelling).
+    Candidates are states drawn uniformly and independently of the transitions. There must be at
+    least one transition (``num_transitions``); an empty replay gives a batch without meaning.
+    """
+    pair_key, goal_key, candidate_key = jax.random.split(key, 3)
+    pairs = draw_transitions(replay, batch_size, pair_key)
+    current, following = (pairs.lane, pairs.position), (pairs.lane, pairs.position + 1)
+    goal = goal_rows(replay, pairs, mix, goal_key)
+    states = draw_states(replay, batch_size, candidate_key)
+    candidate = (states.lane, states.position)
+
+    goals = "observation" if spec.goal_is_observation else "achieved_goal"
+    truth = goals if spec.state_shape is None else "achieved_state"
+    reward, terminated = spec.task(read(replay, truth, *following), read(replay, truth, *goal))
+    return Batch(
+        observation=read(replay, "observation", *current),
+        action=read(replay, "action", *current),
+        reward=reward,
+        terminated=terminated,
+        next_observation=read(replay, "observation", *following),
+        goal=read(replay, goals, *goal),
+        subgoal_candidate=Subgoal(
+            read(replay, "observation", *candidate), read(replay, goals, *candidate)
+        ),
+    )
+
+
+def num_transitions(replay: ReplayState) -> Int[Array, ""]:
+    """Return the number of stored transitions that can be drawn."""
+    return jnp.sum(live(replay).transitions)
+
+
+def memory_bytes(spec: EnvSpec, capacity: int, num_lanes: int) -> int:
+    """Return the size in bytes of the arrays that ``create`` would allocate.
+
+    Raises:
+        ConfigurationError: As ``create``.
+    """
+    return num_bytes(jax.eval_shape(lambda: create(spec, capacity, num_lanes)))
+
+
+def _check(spec: EnvSpec, capacity: int, num_lanes: int) -> None:
+    """Check that a lane holds two of the longest episodes, so that one is always whole."""
+    needed = 2 * (spec.max_episode_steps + 2) * max(num_lanes, 1)
+    if num_lanes < 1 or capacity < needed:
+        raise ConfigurationError(
+            f"replay of {capacity} rows for {num_lanes} environments of {spec.name}: at least one "
+            f"environment and {needed} rows are needed (two episodes of "
+            f"{spec.max_episode_steps} steps for each)"
+        )
+
+
+def _row_kinds(spec: EnvSpec) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Return shape and dtype of what one row holds, by name."""
+    kinds = {
+        "observation": (spec.observation_shape, spec.observation_dtype),
+        "action": ((spec.action_dim,), "float32"),
+    }
+    if not spec.goal_is_observation:
+        kinds["achieved_goal"] = (spec.goal_shape, "float32")
+    if spec.state_shape is not None:
+        kinds["achieved_state"] = (spec.state_shape, "float32")
+    return kinds
+
+
+def _state_row(replay: ReplayState, observation: Observation) -> Mapping[str, Any]:
+    """Return the parts of an observation that the row of a state holds."""
+    return {name: observation[name] for name in replay.rows if name != "action"}
+
+
+def _goal_row(replay: ReplayState, observation: Observation) -> Mapping[str, Any]:
+    """Return the parts of an observation that the goal row holds, where a state holds its own."""
+    goals = "achieved_goal" if "achieved_goal" in replay.rows else "observation"
+    row = {goals: observation["desired_goal"]}
+    if "achieved_state" in replay.rows:
+        row["achieved_state"] = observation["desired_state"]
+    return row
