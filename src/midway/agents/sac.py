@@ -1,0 +1,242 @@
+"""SAC: soft actor-critic with a learned entropy coefficient, on the same hindsight replay as RIS.
+
+Haarnoja et al., "Soft actor-critic algorithms and applications" (2018), with goals as inputs; the
+target entropy is -dim(A) (appendix D). One update does, in this order: critics, policy, entropy
+coefficient, Polyak copies. Each step uses the networks that the step before has just updated.
+"""
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Key, Shaped
+
+from midway import functional
+from midway.networks import encoder as encoders
+from midway.networks import optimizer
+from midway.networks.critics import TwinCritic
+from midway.networks.encoder import StateEncoder
+from midway.networks.mlp import Precision
+from midway.networks.policies import Gaussian, GaussianPolicy
+from midway.types import Batch, EnvSpec, Metrics
+
+
+@dataclass(frozen=True)
+class Config:
+    """Hyperparameters of SAC; the defaults are table 1, ant navigation.
+
+    Attributes:
+        hidden: Hidden layers of every network.
+        discount: γ.
+        target_update_rate: τ, of the target critics.
+        critic_learning_rate: Adam's rate for the critics.
+        policy_learning_rate: Adam's rate for the policy.
+        entropy_learning_rate: Adam's rate for the logarithm of the entropy coefficient.
+        encoder_learning_rate: Adam's rate for the image encoder.
+        precision: Products in ``f32`` or ``bf16``; everything else is float32.
+    """
+
+    hidden: tuple[int, ...] = (256, 256)
+    discount: float = 0.99
+    target_update_rate: float = 0.005
+    critic_learning_rate: float = 1e-3
+    policy_learning_rate: float = 1e-3
+    entropy_learning_rate: float = 1e-3
+    encoder_learning_rate: float = 1e-4
+    precision: Precision = "f32"
+
+
+class State(eqx.Module):
+    """Networks, the logarithm of the entropy coefficient, and their optimisers."""
+
+    encoder: StateEncoder
+    critic: TwinCritic
+    target_critic: TwinCritic
+    policy: GaussianPolicy
+    log_entropy_coefficient: Float[Array, ""]
+    encoder_optimizer: optax.OptState
+    critic_optimizer: optax.OptState
+    policy_optimizer: optax.OptState
+    entropy_optimizer: optax.OptState
+    config: Config = eqx.field(static=True)
+    spec: EnvSpec = eqx.field(static=True)
+
+
+NETWORKS = ("encoder", "critic", "target_critic", "policy")
+"""The parts of the state that a saved policy holds."""
+
+
+# --- losses ---------------------------------------------------------------------------------------
+
+
+def sample(
+    actions: Gaussian, noise: Float[Array, "B A"]
+) -> tuple[Float[Array, "B A"], Float[Array, " B"]]:
+    """Return tanh-squashed actions and their log-densities log π_θ(a | s, g)."""
+    pre_tanh = actions.sample(noise)
+    log_density = actions.log_density(pre_tanh) - functional.tanh_log_determinant(pre_tanh)
+    return jnp.tanh(pre_tanh), log_density
+
+
+def critic_target(state: State, batch: Batch, noise: Float[Array, "B A"]) -> Float[Array, " B"]:
+    """Return r + γ (1 - terminated) (min Q'(s', a', g) - c log π(a' | s', g)), a' ~ π_θ."""
+    next_action, log_density = sample(state.policy(batch.next_observation, batch.goal), noise)
+    next_q = state.target_critic(batch.next_observation, next_action, batch.goal).min(0)
+    next_value = next_q - jnp.exp(state.log_entropy_coefficient) * log_density
+    terminated = batch.terminated.astype(jnp.float32)
+    return functional.td_target(batch.reward, terminated, next_value, state.config.discount)
+
+
+def critic_loss(
+    networks: tuple[TwinCritic, StateEncoder],
+    observation: Shaped[Array, "B ..."],
+    batch: Batch,
+    target: Float[Array, " B"],
+) -> tuple[Float[Array, ""], tuple[Float[Array, "B S"], Metrics]]:
+    """Return the loss of the critics, and the codes of the current observations."""
+    critic, encoder = networks
+    code = encoder(observation)
+    q = critic(code, batch.action, batch.goal)
+    loss = functional.critic_loss(q, target)
+    return loss, (code, {"critic/loss": loss, "critic/q": q.mean(), "critic/target": target.mean()})
+
+
+def policy_loss(
+    policy: GaussianPolicy, state: State, batch: Batch, noise: Float[Array, "B A"]
+) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Metrics]]:
+    """Return the mean of c log π_θ(a | s, g) - min Q, and the entropy estimate."""
+    action, log_density = sample(policy(batch.observation, batch.goal), noise)
+    q = state.critic(batch.observation, action, batch.goal).min(0)
+    loss = (jnp.exp(state.log_entropy_coefficient) * log_density - q).mean()
+    entropy = -log_density.mean()
+    return loss, (entropy, {"policy/loss": loss, "policy/entropy": entropy})
+
+
+def entropy_loss(
+    log_entropy_coefficient: Float[Array, ""], entropy: Float[Array, ""], target: float
+) -> Float[Array, ""]:
+    """Return log c times what the entropy exceeds its target by."""
+    return log_entropy_coefficient * (jax.lax.stop_gradient(entropy) - target)
+
+
+# --- update ---------------------------------------------------------------------------------------
+
+
+def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
+    """Return the state after one gradient step of every network, and scalars to log."""
+    encoding_key, target_key, action_key = jax.random.split(key, 3)
+    observation, batch = encode(state, batch, encoding_key)
+    state, code, critic_metrics = update_critic(state, observation, batch, target_key)
+    state, policy_metrics = update_policy(state, batch._replace(observation=code), action_key)
+    target_critic = functional.polyak_update(
+        state.critic, state.target_critic, state.config.target_update_rate
+    )
+    return replace(state, target_critic=target_critic), critic_metrics | policy_metrics
+
+
+def encode(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[Shaped[Array, "B ..."], Batch]:
+    """Return the augmented observation, and the batch with next observation and goal as codes."""
+    keys = jax.random.split(key, 3)
+    encoder = state.encoder
+
+    def code(image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Float[Array, "B S"]:
+        return jax.lax.stop_gradient(encoder(encoder.augment(image, key)))
+
+    fixed = batch._replace(
+        next_observation=code(batch.next_observation, keys[1]), goal=code(batch.goal, keys[2])
+    )
+    return encoder.augment(batch.observation, keys[0]), fixed
+
+
+def update_critic(
+    state: State, observation: Shaped[Array, "B ..."], batch: Batch, key: Key[Array, ""]
+) -> tuple[State, Float[Array, "B S"], Metrics]:
+    """Step the critics and the encoder; also return the codes of the current observations."""
+    target = critic_target(state, batch, jax.random.normal(key, batch.action.shape))
+    gradient_of = eqx.filter_value_and_grad(critic_loss, has_aux=True)
+    (_, (code, metrics)), (critic_gradient, encoder_gradient) = gradient_of(
+        (state.critic, state.encoder), observation, batch, target
+    )
+    critic, critic_optimizer = optimizer.step(
+        state.critic, critic_gradient, state.critic_optimizer, state.config.critic_learning_rate
+    )
+    encoder, encoder_optimizer = optimizer.step(
+        state.encoder, encoder_gradient, state.encoder_optimizer, state.config.encoder_learning_rate
+    )
+    state = replace(
+        state,
+        critic=critic,
+        critic_optimizer=critic_optimizer,
+        encoder=encoder,
+        encoder_optimizer=encoder_optimizer,
+    )
+    return state, jax.lax.stop_gradient(code), metrics
+
+
+def update_policy(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
+    """Step the policy, then the entropy coefficient towards the target entropy -dim(A)."""
+    noise = jax.random.normal(key, batch.action.shape)
+    gradient_of = eqx.filter_value_and_grad(policy_loss, has_aux=True)
+    (_, (entropy, metrics)), gradient = gradient_of(state.policy, state, batch, noise)
+    policy, policy_optimizer = optimizer.step(
+        state.policy, gradient, state.policy_optimizer, state.config.policy_learning_rate
+    )
+    entropy_gradient = jax.grad(entropy_loss)(
+        state.log_entropy_coefficient, entropy, -float(state.spec.action_dim)
+    )
+    log_entropy_coefficient, entropy_optimizer = optimizer.step(
+        state.log_entropy_coefficient,
+        entropy_gradient,
+        state.entropy_optimizer,
+        state.config.entropy_learning_rate,
+    )
+    state = replace(
+        state,
+        policy=policy,
+        policy_optimizer=policy_optimizer,
+        log_entropy_coefficient=log_entropy_coefficient,
+        entropy_optimizer=entropy_optimizer,
+    )
+    return state, metrics | {"policy/entropy_coefficient": jnp.exp(log_entropy_coefficient)}
+
+
+# --- act and create -------------------------------------------------------------------------------
+
+
+def act(
+    state: State,
+    observation: Shaped[Array, "B ..."],
+    goal: Shaped[Array, "B ..."],
+    key: Key[Array, ""],
+    explore: bool,
+) -> Float[Array, "B A"]:
+    """Return actions in [-1, 1]: sampled where ``explore``, else the tanh of the mean."""
+    actions = state.policy(state.encoder(observation), state.encoder(goal))
+    if not explore:
+        return jnp.tanh(actions.mean)
+    return jnp.tanh(actions.sample(jax.random.normal(key, actions.mean.shape)))
+
+
+def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
+    """Return networks at their random start; the target critics equal the critics."""
+    encoder_key, critic_key, policy_key = jax.random.split(key, 3)
+    pair = sum(encoders.code_sizes(spec))
+    encoder = encoders.create(spec, encoder_key)
+    critic = TwinCritic(pair + spec.action_dim, config.hidden, config.precision, key=critic_key)
+    policy = GaussianPolicy(pair, spec.action_dim, config.hidden, config.precision, key=policy_key)
+    log_entropy_coefficient = jnp.zeros(())
+    return State(
+        encoder=encoder,
+        critic=critic,
+        target_critic=functional.copy(critic),
+        policy=policy,
+        log_entropy_coefficient=log_entropy_coefficient,
+        encoder_optimizer=optimizer.init(encoder),
+        critic_optimizer=optimizer.init(critic),
+        policy_optimizer=optimizer.init(policy),
+        entropy_optimizer=optimizer.init(log_entropy_coefficient),
+        config=config,
+        spec=spec,
+    )
