@@ -1,0 +1,147 @@
+"""What the robots in mazes have in common: walls, starts, goals and success."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium import spaces
+from jaxtyping import Float, Float32, Int
+
+from midway.envs.mazes import ROBOT_RADIUS, WALL_HEIGHT, Maze
+from midway.envs.simulation import SimulationVectorEnv
+from midway.envs.vector import Array, Observations
+from midway.types import ConfigurationError, DistanceTask, EnvSpec
+
+GOAL_THRESHOLD = 0.5
+"""Distance in x-y below which the goal is reached (m); paper, appendix C."""
+
+ROUNDING = 1e-5
+"""More than float32 rounding can take from a distance in a maze (m)."""
+
+
+class MazeVectorEnv(SimulationVectorEnv):
+    """A robot in a maze whose observation is its full state and whose goals are full states.
+
+    A subclass implements ``_pose`` and ``_encode``.
+
+    Args:
+        maze: The maze, which the model's walls are of.
+        model: The MuJoCo model of one copy.
+        name: The name that users type.
+        num_envs: Number of copies.
+        task: The first current task.
+        observation_box: Bounds of one observation, and so of one goal.
+        max_episode_steps: Steps after which an episode is truncated.
+        substeps: Simulation steps for each environment step.
+        num_threads: Threads that simulate, 0 for one per core.
+
+    Raises:
+        ConfigurationError: As ``GoalVectorEnv``.
+    """
+
+    option_names = (*SimulationVectorEnv.option_names, "start", "goal")
+
+    def __init__(
+        self,
+        maze: Maze,
+        model: mujoco.MjModel,
+        name: str,
+        num_envs: int,
+        task: str,
+        observation_box: spaces.Box,
+        max_episode_steps: int,
+        substeps: int,
+        num_threads: int = 0,
+    ) -> None:
+        self.maze = maze
+        goal_spec = EnvSpec(
+            name=name,
+            observation_shape=observation_box.shape,
+            observation_dtype="float32",
+            goal_shape=observation_box.shape,
+            action_dim=model.nu,
+            max_episode_steps=max_episode_steps,
+            goal_is_observation=True,
+            state_shape=None,
+            task=DistanceTask(groups=((0, 1),), threshold=GOAL_THRESHOLD),
+        )
+        super().__init__(
+            model=model,
+            goal_spec=goal_spec,
+            num_envs=num_envs,
+            tasks=tuple(maze.cases),
+            task=task,
+            observation_box=observation_box,
+            goal_box=observation_box,
+            substeps=substeps,
+            num_threads=num_threads,
+        )
+
+    @abstractmethod
+    def _pose(
+        self, rng: np.random.Generator, position: Float[Array, "2"]
+    ) -> Float[Array, " num_positions"]:
+        """Return the joint positions of a start or goal at this x-y (m)."""
+
+    @abstractmethod
+    def _encode(
+        self, qpos: Float[Array, "n num_positions"], qvel: Float[Array, "n num_velocities"]
+    ) -> Float32[Array, "n observation_dim"]:
+        """Return the observations of these states."""
+
+    def _achieved(self) -> Observations:
+        observation = self._encode(self._qpos, self._qvel)
+        return {"observation": observation, "achieved_goal": observation.copy()}
+
+    def _place(self, copies: Int[Array, " n"], options: Mapping[str, Any]) -> None:
+        given = [self._given(options.get(role), role) for role in ("start", "goal")]
+        starts, goals = [], []
+        for copy in copies:
+            rng = self.generators[copy]
+            start, goal = self.maze.sample_start_and_goal(
+                rng, self.task, GOAL_THRESHOLD + ROUNDING, *(points[copy] for points in given)
+            )
+            goals.append(self._pose(rng, goal))
+            starts.append(self._pose(rng, start))
+        self._qpos[copies] = starts
+        at_rest = np.zeros((len(copies), self._qvel.shape[1]))
+        self._goals["desired_goal"][copies] = self._encode(np.stack(goals), at_rest)
+
+    def _given(self, points: Any, role: str) -> list[Float[Array, "2"] | None]:
+        """Return for each copy the start or goal that the user's options name, if they do.
+
+        Raises:
+            ConfigurationError: A point in a wall or outside the maze, or of the wrong shape.
+        """
+        if points is None:
+            return [None] * self.num_envs
+        try:
+            points = np.broadcast_to(np.asarray(points, np.float64), (self.num_envs, 2))
+        except ValueError:
+            raise ConfigurationError(
+                f"{role} {points!r}: must be an x-y position, or one for each copy"
+            ) from None
+        if not self.maze.free(points, radius=0).all():
+            raise ConfigurationError(f"{role} {points.tolist()}: in a wall or outside the maze")
+        return list(points)
+
+
+def walls_mjcf(maze: Maze, inner: str, outer: str) -> str:
+    """Return the walls of a maze as MJCF, with these attributes of inner and outer walls.
+
+    The boxes are centred on the floor, so half of each is below it (original environment).
+    """
+    return "\n".join(
+        f'<geom name="{kind}-{number}" type="box" pos="{wall.x} {wall.y} 0" '
+        f'size="{wall.half_x} {wall.half_y} {WALL_HEIGHT}" {attributes}/>'
+        for kind, walls, attributes in (
+            ("inner", maze.inner_walls, inner),
+            ("outer", maze.outer_walls, outer),
+        )
+        for number, wall in enumerate(walls, start=1)
+    )
+
+
+__all__ = ["GOAL_THRESHOLD", "ROBOT_RADIUS", "MazeVectorEnv", "walls_mjcf"]

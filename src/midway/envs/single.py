@@ -1,0 +1,87 @@
+"""The single environments that Gymnasium makes: batches of one."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from midway.envs.registry import make_vec
+from midway.envs.vector import Array, Observations
+
+
+class SingleGoalEnv(gymnasium.Env[Observations, Array]):
+    """A goal environment of the registry, as a batch of one.
+
+    Observations are dictionaries with ``observation``, ``achieved_goal`` and ``desired_goal``.
+    There is nothing to render: figures are drawn from the states.
+
+    Args:
+        name: A name of the registry, such as ``point-u``.
+        task: A task of the environment.
+
+    Raises:
+        ConfigurationError: An unknown name or task.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, name: str, task: str = "uniform") -> None:
+        self.vector = make_vec(name, num_envs=1, task=task, num_threads=1)
+        self.goal_spec = self.vector.goal_spec
+        self.observation_space: gymnasium.Space[Any] = self.vector.single_observation_space
+        self.action_space = self.vector.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start a new episode; options are those of the vector environment.
+
+        Raises:
+            ConfigurationError: An unknown option or task.
+        """
+        super().reset(seed=seed)
+        # One generator serves both, so that what Gymnasium sees of it is true.
+        self.vector.generators[0] = self.np_random
+        observations, info = self.vector.reset(options=options)
+        return _first(observations), _first_info(info)
+
+    def step(self, action: Array) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
+        """Move by one step.
+
+        Args:
+            action: ``(action_dim,)``, in [-1, 1].
+
+        Raises:
+            ResetNeeded: The episode has ended or never begun.
+            ValueError: An action of another shape, or not finite.
+        """
+        observations, reward, terminated, truncated, info = self.vector.step(
+            np.asarray(action)[None]
+        )
+        return (
+            _first(observations),
+            float(reward[0]),
+            bool(terminated[0]),
+            bool(truncated[0]),
+            _first_info(info),
+        )
+
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
+        """Return the reward of goals ``(goal_dim,)`` or ``(n, goal_dim)``; info is not used."""
+        return self.goal_spec.task(achieved_goal, desired_goal)[0]
+
+    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
+        """Return whether the goal is reached, for one or n goals; info is not used."""
+        return self.goal_spec.task(achieved_goal, desired_goal)[1]
+
+    def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> bool:
+        """Return whether ``info`` is of the last step that an episode may have."""
+        return bool(info["elapsed_steps"] >= self.goal_spec.max_episode_steps)
+
+
+def _first(observations: Observations) -> Observations:
+    return {name: batch[0] for name, batch in observations.items()}
+
+
+def _first_info(info: dict[str, Any]) -> dict[str, Any]:
+    return {name: batch[0].item() for name, batch in info.items() if not name.startswith("_")}
