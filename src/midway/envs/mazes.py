@@ -19,8 +19,11 @@ WALL_HEIGHT = 1.0
 ROBOT_RADIUS = 0.75
 """Distance that start and goal points keep from every wall (m)."""
 
-MAX_DRAWS = 10_000
-"""Draws of one random point before giving up; the worst maze accepts 39 % of the points."""
+MAX_DRAWS = 1000
+"""Rounds of random draws before giving up; the worst maze accepts 39 % of the points."""
+
+POINTS_PER_DRAW = 8
+"""Points drawn at once, of which the first free one is taken: quicker than one after another."""
 
 
 @dataclass(frozen=True)
@@ -129,9 +132,10 @@ class Maze:
             ConfigurationError: The box holds no free point.
         """
         for _ in range(MAX_DRAWS):
-            point = rng.uniform(box.low, box.high)
-            if self.free(point, radius):
-                return point
+            points = rng.uniform(box.low, box.high, (POINTS_PER_DRAW, 2))
+            free = self.free(points, radius)
+            if free.any():
+                return np.asarray(points[free.argmax()])
         raise ConfigurationError(f"maze {self.name!r}: no free point in {box}")
 
     def sample_start_and_goal(
@@ -150,13 +154,16 @@ class Maze:
             ConfigurationError: No start and goal are so far apart.
         """
         case = self.cases[task]
+        goal_point = self.sample_point(rng, case.goal) if goal is None else goal
+        start_point = self.sample_point(rng, case.start) if start is None else start
+        both_given = start is not None and goal is not None
         for _ in range(MAX_DRAWS):
-            goal_point = self.sample_point(rng, case.goal) if goal is None else goal
-            for _ in range(1 if start is not None else MAX_DRAWS):
-                start_point = self.sample_point(rng, case.start) if start is None else start
-                given = start is not None and goal is not None
-                if given or np.linalg.norm(start_point - goal_point) >= apart:
-                    return start_point, goal_point
+            if both_given or np.linalg.norm(start_point - goal_point) >= apart:
+                return start_point, goal_point
+            if start is None:
+                start_point = self.sample_point(rng, case.start)
+            else:
+                goal_point = self.sample_point(rng, case.goal)
         raise ConfigurationError(f"maze {self.name!r}, task {task!r}: start always at the goal")
 
 

@@ -65,6 +65,8 @@ class PointMazeVectorEnv(MazeVectorEnv):
         ConfigurationError: An unknown task, or no copies.
     """
 
+    copies_per_thread = 2
+
     def __init__(
         self, maze: str, num_envs: int = 1, task: str = "uniform", num_threads: int = 0
     ) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+from midway.envs.ant_maze import AntMazeVectorEnv
 from midway.envs.ids import GYM_IDS
 from midway.envs.mazes import MAZES
 from midway.envs.point_maze import PointMazeVectorEnv
@@ -49,6 +50,7 @@ ENVIRONMENTS: dict[str, Entry] = {
     entry.name: entry
     for entry in [
         *_maze_entries("point", "point mass", PointMazeVectorEnv),
+        *_maze_entries("ant", "four-legged ant", AntMazeVectorEnv),
     ]
 }
 """Every environment by name, in the order of lists."""

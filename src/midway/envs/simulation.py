@@ -36,12 +36,15 @@ class SimulationVectorEnv(GoalVectorEnv):
         goal_box: Bounds of one goal.
         state_box: Bounds of the state that success is measured on, where goals are images.
         substeps: Simulation steps for each environment step.
-        num_threads: Threads that simulate; 0 for one per core that the process may use. Results
-            do not depend on it.
+        num_threads: Threads that simulate; 0 for one per core that the process may use, but no
+            more than ``copies_per_thread`` justifies. Results do not depend on it.
 
     Raises:
         ConfigurationError: As ``GoalVectorEnv``.
     """
+
+    copies_per_thread = 1
+    """Copies that are worth a thread of their own: more where a step takes microseconds."""
 
     def __init__(
         self,
@@ -59,7 +62,9 @@ class SimulationVectorEnv(GoalVectorEnv):
         super().__init__(goal_spec, num_envs, tasks, task, observation_box, goal_box, state_box)
         # A simulation that diverges shall show as NaN, not jump to the model's default pose.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
-        self.batch = Batch(model, num_envs, min(num_threads or num_cores(), num_envs))
+        if num_threads == 0:
+            num_threads = min(num_cores(), -(-num_envs // self.copies_per_thread))
+        self.batch = Batch(model, num_envs, min(num_threads, num_envs))
         self._substeps = substeps
         # These are live views of the simulations' state.
         self._qpos = self.batch.bind("qpos")
