@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Key, Shaped
 
@@ -21,6 +21,7 @@ class NonFiniteError(RuntimeError):
     """A loss or value became NaN or infinite; its text names the quantity."""
 
 
+@runtime_checkable
 class GoalTask(Protocol):
     """The one definition of success, shared by collection, replay, evaluation and tests."""
 
