@@ -1,0 +1,234 @@
+"""The Python interface: train, resume, load, evaluate."""
+
+import ast
+import dataclasses
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from midway import presets
+from midway.agents import registry as agents
+from midway.envs import registry as environments
+from midway.training import loop
+from midway.training import policy as policies
+from midway.training.checkpoint import Checkpoints
+from midway.training.config import TrainConfig
+from midway.training.evaluate import ActionKind, Evaluation, run_episodes
+from midway.training.folder import RunConfig, RunFolder
+from midway.training.logging import Logger
+from midway.training.policy import Policy
+from midway.training.progress import Reporter, Silent, reporter
+from midway.types import ConfigurationError
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What a finished or interrupted run leaves.
+
+    Attributes:
+        path: The run folder.
+        finished: Whether all steps were taken.
+    """
+
+    path: Path
+    finished: bool
+
+
+def configure(
+    env: str,
+    agent: str = "ris",
+    preset: str = "quick",
+    seed: int = 0,
+    changes: Mapping[str, Any] | None = None,
+) -> RunConfig:
+    """Return a preset with some values changed.
+
+    Args:
+        env: Environment name.
+        agent: Agent name.
+        preset: ``paper`` or ``quick``.
+        seed: The one seed of every generator.
+        changes: Values by their field names in `TrainConfig` or the agent's ``Config``; text is
+            read as Python literals.
+
+    Raises:
+        ConfigurationError: A name is unknown or a value has the wrong type.
+    """
+    environments.entry(env)
+    train, hyperparameters = presets.preset(env, agent, preset)
+    for name, value in (changes or {}).items():
+        if name in _field_names(train):
+            train = _changed(train, name, value)
+        elif name in _field_names(hyperparameters):
+            hyperparameters = _changed(hyperparameters, name, value)
+        else:
+            allowed = ", ".join((*_field_names(train), *_field_names(hyperparameters)))
+            raise ConfigurationError(f"unknown setting {name!r}: use one of {allowed}")
+    return RunConfig(env, agent, preset, seed, train, hyperparameters)
+
+
+def train(
+    env: str,
+    *,
+    agent: str = "ris",
+    preset: str = "quick",
+    steps: int | None = None,
+    seed: int = 0,
+    num_envs: int | None = None,
+    out: str | Path | None = None,
+    precision: str | None = None,
+    changes: Mapping[str, Any] | None = None,
+    progress: bool = False,
+) -> Run:
+    """Train an agent on an environment and write a run folder.
+
+    Args:
+        env: Environment name.
+        agent: ``ris``, ``sac`` and so on.
+        preset: ``paper`` or ``quick``.
+        steps: Environment steps; default: the preset's.
+        seed: The one seed of every generator.
+        num_envs: Parallel environments; default: the preset's.
+        out: The run folder; default: ``runs/ENV-AGENT-seedN``.
+        precision: ``f32`` or ``bf16``; default: the preset's.
+        changes: Other settings, as in `configure`.
+        progress: Whether to report on standard error.
+
+    Raises:
+        ConfigurationError: A name, value or folder cannot be used.
+        NonFiniteError: A loss became NaN or infinite; the last good checkpoint is kept.
+    """
+    named = {"steps": steps, "num_envs": num_envs, "precision": precision}
+    given = {name: value for name, value in named.items() if value is not None}
+    config = configure(env, agent, preset, seed, {**(changes or {}), **given})
+    folder = RunFolder(Path(out or Path("runs") / f"{env}-{agent}-seed{seed}"))
+    training = _build(config, folder)
+    folder.create(config)
+    return _run(training, progress)
+
+
+def resume(path: str | Path, steps: int | None = None, progress: bool = False) -> Run:
+    """Continue a run from its newest whole checkpoint, bit for bit.
+
+    Args:
+        path: The run folder.
+        steps: New total of environment steps; default: the run's own.
+        progress: Whether to report on standard error.
+
+    Raises:
+        ConfigurationError: This is no run folder, or its checkpoint is damaged or foreign.
+        NonFiniteError: A loss became NaN or infinite.
+    """
+    folder = RunFolder(Path(path))
+    config = folder.load_config()
+    if steps is not None:
+        config = dataclasses.replace(
+            config, train=dataclasses.replace(config.train, steps=int(steps))
+        )
+    return _run(_build(config, folder), progress)
+
+
+def load(path: str | Path) -> Policy:
+    """Return the policy of a run: ``policy(observation, goal) -> action``.
+
+    Raises:
+        ConfigurationError: The folder holds no policy, or a damaged or foreign one.
+    """
+    folder = RunFolder(Path(path))
+    config = folder.load_config()
+    return policies.load(folder, environments.make_vec(config.env).goal_spec)
+
+
+def evaluate(
+    path: str | Path,
+    *,
+    episodes: int = 100,
+    task: str = "hard",
+    actions: ActionKind = "mean",
+    seed: int = 0,
+) -> Evaluation:
+    """Run episodes of a trained policy.
+
+    Args:
+        path: The run folder.
+        episodes: Number of episodes.
+        task: ``hard``, ``uniform`` or a named case of the environment.
+        actions: ``mean`` or ``sampled``.
+        seed: Seed of starts and goals.
+
+    Raises:
+        ConfigurationError: The folder, the task or the number of episodes cannot be used.
+    """
+    if episodes < 1:
+        raise ConfigurationError(f"episodes {episodes}: must be at least 1")
+    policy = load(path)
+    env = environments.make_vec(policy.config.env, num_envs=episodes, task=task)
+    keys = map(partial(jax.random.fold_in, jax.random.key(seed)), iter(range(2**31)))
+
+    def act(observation: Any, goal: Any) -> Any:
+        if actions == "mean":
+            return policy(observation, goal)
+        return policy.sample(observation, goal, next(keys))
+
+    # The seeds of training and its evaluations come from a hash; these must not meet them.
+    return run_episodes(
+        env, act, task, actions, int(np.random.SeedSequence((seed, 1)).generate_state(1)[0])
+    )
+
+
+def _build(config: RunConfig, folder: RunFolder) -> loop.Training:
+    def make_env(num_envs: int, task: str) -> Any:
+        return environments.make_vec(config.env, num_envs=num_envs, task=task)
+
+    return loop.Training(agents.get(config.agent), config, make_env, folder)
+
+
+def _run(training: loop.Training, progress: bool) -> Run:
+    """Restore the newest checkpoint if there is one, then train."""
+    folder = training.folder
+    checkpoints = Checkpoints(folder.checkpoints)
+    latest = checkpoints.latest()
+    if latest is not None:
+        training.load_state_dict(checkpoints.restore(latest, training.state_dict()))
+    say: Reporter = reporter(training.config.train.steps, training.steps) if progress else Silent()
+    logger = Logger(
+        folder.metrics_file, folder.evaluation_file, folder.path / "events", training.steps
+    )
+    try:
+        return Run(folder.path, loop.run(training, checkpoints, logger, say))
+    finally:
+        say.close()
+        logger.close()
+        checkpoints.close()
+
+
+def _field_names(config: Any) -> tuple[str, ...]:
+    return tuple(field.name for field in dataclasses.fields(config))
+
+
+def _changed(config: Any, name: str, value: Any) -> Any:
+    """Return the dataclass with one value replaced by one of the same type."""
+    old = getattr(config, name)
+    if isinstance(value, str) and not isinstance(old, str):
+        try:
+            value = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            raise ConfigurationError(f"{name} {value!r}: not a {type(old).__name__}") from None
+    if isinstance(old, TrainConfig) or dataclasses.is_dataclass(old):
+        try:
+            value = type(old)(*value)
+        except TypeError:
+            raise ConfigurationError(f"{name} {value!r}: one value for each share") from None
+    if isinstance(old, float) and isinstance(value, int):
+        value = float(value)
+    if isinstance(old, int) and isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if type(value) is not type(old):
+        raise ConfigurationError(f"{name} {value!r}: must be a {type(old).__name__}")
+    if name == "precision" and value not in ("f32", "bf16"):
+        raise ConfigurationError(f"precision {value!r}: choose f32 or bf16")
+    return dataclasses.replace(config, **{name: value})

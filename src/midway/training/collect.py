@@ -1,0 +1,92 @@
+"""Collection: one step of every parallel environment into the replay."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from midway.replay.storage import ReplayState
+from midway.training import step
+from midway.types import ConfigurationError
+
+Actions = Callable[[dict[str, Any]], np.ndarray[Any, np.dtype[np.float32]]]
+
+
+@dataclass
+class EpisodeCounts:
+    """What happened in the episodes that ended since the last row of metrics."""
+
+    episodes: int = 0
+    successes: int = 0
+    length: int = 0
+
+    def metrics(self) -> dict[str, float]:
+        """Return means over the ended episodes; empty where none ended."""
+        if self.episodes == 0:
+            return {}
+        return {
+            "collect/success_rate": self.successes / self.episodes,
+            "collect/episode_length": self.length / self.episodes,
+        }
+
+
+@dataclass
+class Collector:
+    """Environments in the middle of their episodes.
+
+    Attributes:
+        env: A vector environment without autoreset.
+        observation: The newest observations of all copies.
+        counts: Episodes that ended since they were last reset.
+    """
+
+    env: Any
+    observation: dict[str, Any]
+    counts: EpisodeCounts = field(default_factory=EpisodeCounts)
+
+    @staticmethod
+    def start(env: Any, replay: ReplayState, seed: int) -> tuple["Collector", ReplayState]:
+        """Reset every copy and begin its first episode in the replay."""
+        observation, _ = env.reset(seed=seed)
+        everyone = np.ones(env.num_envs, np.bool_)
+        return Collector(env, observation), step.begin(replay, observation, everyone)
+
+    def step(self, replay: ReplayState, choose: Actions) -> ReplayState:
+        """Take one step in every copy; begin new episodes where one has ended."""
+        actions = choose(self.observation)
+        self.observation, _, terminated, truncated, info = self.env.step(actions)
+        everyone = np.ones(self.env.num_envs, np.bool_)
+        replay = step.add(replay, actions, self.observation, everyone)
+        ended = terminated | truncated
+        if ended.any():
+            self.counts.episodes += int(ended.sum())
+            self.counts.successes += int(terminated.sum())
+            self.counts.length += int(info["elapsed_steps"][ended].sum())
+            self.observation, _ = self.env.reset(options={"reset_mask": ended})
+            replay = step.begin(replay, self.observation, ended)
+        return replay
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return simulators, observations and counts as arrays."""
+        return {
+            "env": self.env.state_dict(),
+            "observation": dict(self.observation),
+            "counts": {name: np.array(value) for name, value in vars(self.counts).items()},
+        }
+
+    @staticmethod
+    def restore(env: Any, state: dict[str, Any]) -> "Collector":
+        """Return the collector that ``state_dict`` was taken from, on a new environment.
+
+        Raises:
+            ConfigurationError: The state is not one of this environment.
+        """
+        try:
+            env.load_state_dict(state["env"])
+        except (KeyError, ValueError) as error:
+            raise ConfigurationError(
+                f"the checkpoint does not fit the environment: {error}"
+            ) from error
+        counts = EpisodeCounts(**{name: int(value) for name, value in state["counts"].items()})
+        return Collector(env, dict(state["observation"]), counts)

@@ -1,0 +1,79 @@
+"""Evaluation: episodes of a policy, without learning."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+ActionKind: TypeAlias = Literal["mean", "sampled"]
+Policy: TypeAlias = Callable[[Any, Any], Any]
+"""``(observation, goal) -> action`` over a batch."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One evaluated episode.
+
+    Attributes:
+        success: Whether the goal was reached.
+        length: Steps taken.
+        final_distance: Distance to the goal after the last step, as success measures it (m).
+    """
+
+    success: bool
+    length: int
+    final_distance: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Episodes of one task with one kind of action."""
+
+    task: str
+    actions: ActionKind
+    episodes: tuple[Episode, ...]
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the episodes that reached their goal."""
+        return float(np.mean([episode.success for episode in self.episodes]))
+
+    @property
+    def final_distance(self) -> float:
+        """Mean distance to the goal at the end of an episode (m)."""
+        return float(np.mean([episode.final_distance for episode in self.episodes]))
+
+    @property
+    def length(self) -> float:
+        """Mean number of steps."""
+        return float(np.mean([episode.length for episode in self.episodes]))
+
+
+def run_episodes(env: Any, policy: Policy, task: str, actions: ActionKind, seed: int) -> Evaluation:
+    """Run one episode in each copy of the environment.
+
+    Args:
+        env: A vector environment without autoreset; one episode for each copy.
+        policy: The policy, whose actions are of the kind ``actions``.
+        task: Distribution of starts and goals.
+        actions: ``mean`` or ``sampled``, for the record.
+        seed: The same seed gives the same starts and goals.
+    """
+    observation, _ = env.reset(seed=seed, options={"task": task})
+    episodes: list[Episode | None] = [None] * env.num_envs
+    while any(episode is None for episode in episodes):
+        action = np.asarray(policy(observation["observation"], observation["desired_goal"]))
+        observation, _, terminated, truncated, info = env.step(action)
+        ended = terminated | truncated
+        for copy in np.flatnonzero(ended):
+            if episodes[copy] is None:
+                episodes[copy] = Episode(
+                    success=bool(terminated[copy]),
+                    length=int(info["elapsed_steps"][copy]),
+                    final_distance=float(info["distance"][copy]),
+                )
+        if ended.any():
+            # Copies that are done go round again, unrecorded, until the last one has ended.
+            observation, _ = env.reset(options={"reset_mask": ended})
+    return Evaluation(task, actions, tuple(e for e in episodes if e is not None))

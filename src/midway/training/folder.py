@@ -1,0 +1,193 @@
+"""The run folder: its configuration, its files, and the versions that made it."""
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from midway.agents import registry
+from midway.training.config import TrainConfig
+from midway.types import ConfigurationError, RelabelMix
+
+FORMAT = 1
+PACKAGES = ("midway", "jax", "equinox", "optax", "mujoco", "gymnasium", "numpy")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides what a run computes.
+
+    Attributes:
+        env: Environment name.
+        agent: Agent name.
+        preset: Preset that the values were taken from, before any were changed.
+        seed: The one seed of every generator.
+        train: Settings of the loop.
+        hyperparameters: The agent's ``Config``.
+    """
+
+    env: str
+    agent: str
+    preset: str
+    seed: int
+    train: TrainConfig
+    hyperparameters: Any
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values."""
+        return dataclasses.asdict(self)
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> "RunConfig":
+        """Return the configuration of ``to_json``.
+
+        Raises:
+            ConfigurationError: A value is missing, unknown or out of range.
+        """
+        try:
+            train = {**values["train"], "relabel": RelabelMix(**values["train"]["relabel"])}
+            agent = {
+                name: tuple(value) if isinstance(value, list) else value
+                for name, value in values["hyperparameters"].items()
+            }
+            return RunConfig(
+                env=values["env"],
+                agent=values["agent"],
+                preset=values["preset"],
+                seed=values["seed"],
+                train=TrainConfig(**train),
+                hyperparameters=registry.get(values["agent"]).Config(**agent),
+            )
+        except (KeyError, TypeError) as error:
+            raise ConfigurationError(f"configuration not understood: {error}") from error
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Names of the files of a run."""
+
+    path: Path
+
+    @property
+    def config_file(self) -> Path:
+        """``config.json``: every value, versions, commit and command."""
+        return self.path / "config.json"
+
+    @property
+    def metrics_file(self) -> Path:
+        """``metrics.csv``: scalars of the updates and of collection."""
+        return self.path / "metrics.csv"
+
+    @property
+    def evaluation_file(self) -> Path:
+        """``evaluation.csv``: success by step, task and kind of action."""
+        return self.path / "evaluation.csv"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the whole states that a run continues from."""
+        return self.path / "checkpoints"
+
+    @property
+    def policy_weights(self) -> Path:
+        """``policy.safetensors``: the networks."""
+        return self.path / "policy.safetensors"
+
+    @property
+    def policy_config(self) -> Path:
+        """``policy.json``: what is needed to build the networks."""
+        return self.path / "policy.json"
+
+    @property
+    def figures(self) -> Path:
+        """Folder of figures."""
+        return self.path / "figures"
+
+    def create(self, config: RunConfig) -> None:
+        """Make the folder and write ``config.json``.
+
+        Raises:
+            ConfigurationError: There is a run already, other files lie there, or it cannot be made.
+        """
+        try:
+            if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+                hint = "use `midway resume`" if self.config_file.exists() else "choose another"
+                raise ConfigurationError(f"run folder {self.path} is not empty: {hint}")
+            self.path.mkdir(parents=True, exist_ok=True)
+            write_json(self.config_file, {**config.to_json(), **provenance()})
+        except OSError as error:
+            raise ConfigurationError(
+                f"cannot make run folder {self.path}: {error.strerror}"
+            ) from error
+
+    def load_config(self) -> RunConfig:
+        """Return the configuration of the run.
+
+        Raises:
+            ConfigurationError: This is no run folder, or not one of this version.
+        """
+        values = read_json(self.config_file)
+        if values.get("format") != FORMAT:
+            raise ConfigurationError(f"{self.config_file}: not a run of this version of midway")
+        return RunConfig.from_json(values)
+
+
+def provenance() -> dict[str, Any]:
+    """Return format, versions, commit, machine and command."""
+    return {
+        "format": FORMAT,
+        "versions": {
+            "python": platform.python_version(),
+            **{name: importlib.metadata.version(name) for name in PACKAGES},
+        },
+        "commit": _commit(),
+        "machine": {"processor": platform.machine(), "cores": len(os.sched_getaffinity(0))},
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+    }
+
+
+def _commit() -> str | None:
+    """Return the commit of the source tree that the package runs from, if it is one."""
+    try:
+        answer = subprocess.run(
+            ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"],
+            capture_output=True,
+            text=True,
+            timeout=10,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return answer.stdout.strip() if answer.returncode == 0 else None
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Write a file that is there whole or not at all."""
+    temporary = path.with_name(path.name + ".new")
+    temporary.write_text(json.dumps(values, indent=2) + "\n")
+    temporary.replace(path)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file.
+
+    Raises:
+        ConfigurationError: The file cannot be read or holds no JSON object.
+    """
+    try:
+        values = json.loads(path.read_text())
+    except OSError as error:
+        raise ConfigurationError(
+            f"{path.parent} is no readable run folder: {path.name}: {error.strerror}"
+        ) from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path} is damaged: {error}") from error
+    if not isinstance(values, dict):
+        raise ConfigurationError(f"{path} is damaged: it holds no JSON object")
+    return values

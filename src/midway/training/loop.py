@@ -1,0 +1,279 @@
+"""The training loop: collect, update, evaluate, log, checkpoint.
+
+Every random draw of the loop comes from the seed and a counter (steps or updates), so that the
+counters are all there is to restore.
+"""
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from midway.replay import buffer
+from midway.training import policy as policies
+from midway.training import step as steps_of
+from midway.training.arrays import named_arrays, with_named_arrays
+from midway.training.checkpoint import Checkpoints
+from midway.training.collect import Collector
+from midway.training.evaluate import ActionKind, Evaluation, run_episodes
+from midway.training.folder import RunConfig, RunFolder
+from midway.training.logging import Logger
+from midway.training.progress import Reporter
+from midway.types import NonFiniteError
+
+EVALUATED_TASKS = ("hard", "uniform")
+EVALUATED_ACTIONS: tuple[ActionKind, ...] = ("mean", "sampled")
+
+MakeEnv = Callable[[int, str], Any]
+"""``(number of copies, task) -> vector environment``."""
+
+
+class Training:
+    """A run in memory.
+
+    Args:
+        agent: The agent's module.
+        config: The configuration of the run.
+        make_env: Makes its environments.
+        folder: Where its files go.
+    """
+
+    def __init__(
+        self, agent: ModuleType, config: RunConfig, make_env: MakeEnv, folder: RunFolder
+    ) -> None:
+        self.config = config
+        self.folder = folder
+        train = config.train
+        seeds = np.random.SeedSequence(config.seed).generate_state(4)
+        self._env_seed, self._evaluation_seed, self._action_seed = (int(s) for s in seeds[:3])
+        network_key, self._update_key, self._act_key, self._evaluation_key = jax.random.split(
+            jax.random.key(int(seeds[3])), 4
+        )
+        self._make_env = make_env
+        env = make_env(train.num_envs, "uniform")
+        self.spec = env.goal_spec
+        self.arrays, self._static = steps_of.split_state(
+            agent.create(config.hyperparameters, self.spec, network_key)
+        )
+        replay = buffer.create(self.spec, train.replay_capacity, train.num_envs)
+        self.totals = steps_of.empty_totals(agent, self.arrays, self._static, train, replay)
+        self._learner = steps_of.compile_learner(agent, self._static, train, self.spec)
+        self.collector, self.replay = Collector.start(env, replay, self._env_seed)
+        self._evaluation_envs: dict[str, Any] = {}
+        self.steps = 0
+        self.updates = 0
+        self.updates_logged = 0
+        self.training_seconds = 0.0
+        self.seconds = 0.0
+
+    # --- one turn of the loop ---------------------------------------------------------------------
+
+    def advance(self) -> None:
+        """Take one step in every environment, then the updates that are due."""
+        started = time.perf_counter()
+        self.replay = self.collector.step(self.replay, self._choose)
+        self.steps += self.config.train.num_envs
+        per_call = self.config.train.updates_per_call
+        while self.config.train.updates_due(self.steps) - self.updates >= per_call:
+            self.arrays, self.totals = self._learner.train(
+                self.arrays, self.totals, self.replay, self._update_key, self.updates
+            )
+            self.updates += per_call
+        self.training_seconds += time.perf_counter() - started
+
+    def _choose(self, observation: dict[str, Any]) -> Any:
+        """Return uniform random actions at first, then sampled actions of the policy."""
+        if self.steps < self.config.train.random_steps:
+            generator = np.random.default_rng((self._action_seed, self.steps))
+            shape = (self.config.train.num_envs, self.spec.action_dim)
+            return generator.uniform(-1, 1, shape).astype(np.float32)
+        key = jax.random.fold_in(self._act_key, self.steps)
+        return np.asarray(
+            self._learner.act(
+                self.arrays, observation["observation"], observation["desired_goal"], key
+            )
+        )
+
+    # --- what is looked at from time to time ------------------------------------------------------
+
+    def metrics(self) -> dict[str, float]:
+        """Return means since the last call, of updates and of collection; then start anew.
+
+        Raises:
+            NonFiniteError: A mean is not finite.
+        """
+        updates = self.updates - self.updates_logged
+        if updates == 0:
+            return {}
+        values = {name: float(t) / updates for name, t in jax.device_get(self.totals).items()}
+        for name, value in values.items():
+            if not np.isfinite(value):
+                raise NonFiniteError(f"{name} became {value} before step {self.steps}")
+        self.totals = jax.tree.map(lambda total: total * 0, self.totals)
+        self.updates_logged = self.updates
+        values |= self.collector.counts.metrics()
+        self.collector.counts = type(self.collector.counts)()
+        return values
+
+    def evaluate(self) -> Iterator[Evaluation]:
+        """Yield the evaluations of the current policy, on environments of their own."""
+        for task in EVALUATED_TASKS:
+            if task not in self._evaluation_envs:
+                episodes = self.config.train.evaluation_episodes
+                self._evaluation_envs[task] = self._make_env(episodes, task)
+            for actions in EVALUATED_ACTIONS:
+                yield run_episodes(
+                    self._evaluation_envs[task],
+                    self._policy(actions),
+                    task,
+                    actions,
+                    self._evaluation_seed,
+                )
+
+    def _policy(self, actions: ActionKind) -> Callable[[Any, Any], Any]:
+        act = self._learner.act_mean if actions == "mean" else self._learner.act
+        counter = iter(range(2**31))
+
+        def policy(observation: Any, goal: Any) -> Any:
+            key = jax.random.fold_in(self._evaluation_key, next(counter))
+            return act(self.arrays, observation, goal, key)
+
+        return policy
+
+    # --- files ------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that the future depends on, as a dictionary of arrays."""
+        counters = {
+            "steps": self.steps,
+            "updates": self.updates,
+            "updates_logged": self.updates_logged,
+            "training_seconds": self.training_seconds,
+            "seconds": self.seconds,
+        }
+        return {
+            "agent": named_arrays(self.arrays),
+            "totals": self.totals,
+            "replay": named_arrays(self.replay),
+            "collector": self.collector.state_dict(),
+            "counters": {name: np.array(value) for name, value in counters.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a ``state_dict``, bit for bit."""
+        self.arrays = with_named_arrays(self.arrays, state["agent"])
+        self.totals = state["totals"]
+        self.replay = with_named_arrays(self.replay, state["replay"])
+        self.collector = Collector.restore(self.collector.env, state["collector"])
+        counters = state["counters"]
+        self.steps = int(counters["steps"])
+        self.updates = int(counters["updates"])
+        self.updates_logged = int(counters["updates_logged"])
+        self.training_seconds = float(counters["training_seconds"])
+        self.seconds = float(counters["seconds"])
+
+    def save(self, checkpoints: Checkpoints) -> None:
+        """Write a checkpoint and the policy.
+
+        Raises:
+            NonFiniteError: A network is not finite; nothing is written then.
+        """
+        for name, array in named_arrays(self.arrays).items():
+            if not bool(np.isfinite(np.asarray(array)).all()):
+                raise NonFiniteError(f"{name} is not finite at step {self.steps}")
+        checkpoints.save(self.steps, self.state_dict())
+        policies.save(self.folder, self.config, eqx.combine(self.arrays, self._static))
+
+
+def run(training: Training, checkpoints: Checkpoints, logger: Logger, reporter: Reporter) -> bool:
+    """Train until the configured number of steps; return whether it was reached.
+
+    An interrupt (Ctrl-C, or the signal to terminate) ends the run with a checkpoint.
+
+    Raises:
+        NonFiniteError: A loss or a network is not finite; the last good checkpoint is kept.
+    """
+    train = training.config.train
+    started = time.perf_counter() - training.seconds
+    success: dict[str, float] = {}
+    with _interruptible() as interrupted:
+        while training.steps < train.steps and not interrupted.is_set():
+            before = training.steps
+            training.advance()
+            done = training.steps >= train.steps
+
+            def every(count: int, before: int = before, done: bool = done) -> bool:
+                return done or training.steps // count > before // count
+
+            training.seconds = time.perf_counter() - started
+            if every(train.log_every):
+                _log(training, logger, reporter, success)
+            if every(train.evaluate_every):
+                success = _evaluate(training, logger, reporter)
+            training.seconds = time.perf_counter() - started
+            if every(train.checkpoint_every):
+                training.save(checkpoints)
+    if training.steps < train.steps:
+        training.save(checkpoints)
+        reporter.message(f"interrupted: checkpoint of step {training.steps} written")
+    return training.steps >= train.steps
+
+
+def _clock(training: Training) -> dict[str, float]:
+    return {
+        "updates": training.updates,
+        "seconds": round(training.seconds, 3),
+        "training_seconds": round(training.training_seconds, 3),
+    }
+
+
+def _log(training: Training, logger: Logger, reporter: Reporter, success: dict[str, float]) -> None:
+    """Write one row of metrics where there were updates, and say how far the run is."""
+    values = training.metrics()
+    if values:
+        collected = {"collect/success_rate": np.nan, "collect/episode_length": np.nan}
+        logger.metrics(training.steps, {**_clock(training), **collected, **values})
+    speed = training.steps / max(training.seconds, 1e-9)
+    reporter.advance(training.steps, {"steps/s": speed, **success})
+
+
+def _evaluate(training: Training, logger: Logger, reporter: Reporter) -> dict[str, float]:
+    """Evaluate, write a row for each task and kind of action, and return success by task."""
+    success = {}
+    for result in training.evaluate():
+        logger.evaluation(training.steps, _clock(training), result)
+        if result.actions == "mean":
+            success[f"success/{result.task}"] = result.success_rate
+    reporter.advance(training.steps, success)
+    return success
+
+
+@contextmanager
+def _interruptible() -> Iterator[threading.Event]:
+    """Turn the first interrupt into an event; the second one interrupts at once."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    names = (signal.SIGINT, signal.SIGTERM)
+    previous = {name: signal.getsignal(name) for name in names}
+
+    def handle(number: int, frame: Any) -> None:
+        event.set()
+        for name in names:
+            signal.signal(name, previous[name])
+
+    for name in names:
+        signal.signal(name, handle)
+    try:
+        yield event
+    finally:
+        for name in names:
+            signal.signal(name, previous[name])

@@ -1,0 +1,94 @@
+"""Saved policies: weights and a description that others can load."""
+
+import dataclasses
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from midway.agents import registry
+from midway.training.arrays import named_arrays, with_named_arrays
+from midway.training.folder import FORMAT, RunConfig, RunFolder, read_json, write_json
+from midway.types import ConfigurationError, EnvSpec
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A trained policy, ``policy(observation, goal) -> action``.
+
+    Attributes:
+        agent: The agent's module.
+        state: The agent's state with the saved networks; its optimisers are at their start.
+        config: The run that trained it.
+    """
+
+    agent: ModuleType
+    state: Any
+    config: RunConfig
+
+    def __call__(self, observation: Any, goal: Any) -> np.ndarray[Any, Any]:
+        """Return the tanh of the mean action, ``(action_dim,)`` or ``(B, action_dim)``.
+
+        Args:
+            observation: One observation or a batch ``(B, ...)``.
+            goal: One goal or a batch ``(B, ...)``.
+        """
+        observation, goal = np.asarray(observation), np.asarray(goal)
+        single = observation.ndim == len(self.state.spec.observation_shape)
+        if single:
+            observation, goal = observation[None], goal[None]
+        actions = np.asarray(_mean_action(self.agent, self.state, observation, goal))
+        return actions[0] if single else actions
+
+    def sample(self, observation: Any, goal: Any, key: Any) -> np.ndarray[Any, Any]:
+        """Return sampled actions ``(B, action_dim)`` for batches."""
+        return np.asarray(_sampled_action(self.agent, self.state, observation, goal, key))
+
+
+@eqx.filter_jit
+def _mean_action(agent: ModuleType, state: Any, observation: Any, goal: Any) -> Any:
+    return agent.act(state, observation, goal, jax.random.key(0), False)
+
+
+@eqx.filter_jit
+def _sampled_action(agent: ModuleType, state: Any, observation: Any, goal: Any, key: Any) -> Any:
+    return agent.act(state, observation, goal, key, True)
+
+
+def _networks(agent: ModuleType, state: Any) -> dict[str, Any]:
+    return {name: eqx.filter(getattr(state, name), eqx.is_array) for name in agent.NETWORKS}
+
+
+def save(folder: RunFolder, config: RunConfig, state: Any) -> None:
+    """Write ``policy.safetensors`` and ``policy.json``, each whole or not at all."""
+    networks = _networks(registry.get(config.agent), state)
+    arrays = {name: np.asarray(array) for name, array in named_arrays(networks).items()}
+    temporary = folder.policy_weights.with_name("policy.safetensors.new")
+    save_file(arrays, temporary)
+    temporary.replace(folder.policy_weights)
+    spec = dataclasses.asdict(state.spec)
+    del spec["task"]
+    write_json(folder.policy_config, {"format": FORMAT, **config.to_json(), "spec": spec})
+
+
+def load(folder: RunFolder, spec: EnvSpec) -> Policy:
+    """Return the policy of a run folder, for an environment of the same shapes.
+
+    Raises:
+        ConfigurationError: The folder holds no policy, or a damaged or foreign one.
+    """
+    config = RunConfig.from_json(read_json(folder.policy_config))
+    agent = registry.get(config.agent)
+    state = agent.create(config.hyperparameters, spec, jax.random.key(0))
+    try:
+        arrays = load_file(folder.policy_weights)
+    except (OSError, SafetensorError) as error:
+        raise ConfigurationError(f"{folder.policy_weights} cannot be read: {error}") from error
+    networks = with_named_arrays(_networks(agent, state), arrays)
+    loaded = {name: eqx.combine(networks[name], getattr(state, name)) for name in networks}
+    return Policy(agent, dataclasses.replace(state, **loaded), config)

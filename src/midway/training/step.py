@@ -1,0 +1,95 @@
+"""The compiled steps: sample and update, act, and write to the replay."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from types import ModuleType
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, PyTree
+
+from midway.replay import buffer
+from midway.replay.storage import ReplayState
+from midway.training.config import TrainConfig
+from midway.types import EnvSpec, Metrics
+
+Arrays: TypeAlias = PyTree
+"""The arrays of an agent's state; what is static in it is compiled in."""
+
+
+@dataclass(frozen=True)
+class Learner:
+    """An agent's functions compiled over the arrays of its state.
+
+    Attributes:
+        train: ``(arrays, totals, replay, key, updates) -> (arrays, totals)``: several updates, each
+            on a batch of its own; arrays and totals are donated.
+        act: ``(arrays, observation, goal, key) -> actions``, sampled.
+        act_mean: The same with the tanh of the mean.
+    """
+
+    train: Callable[..., tuple[Arrays, Metrics]]
+    act: Callable[..., Float[Array, "K action_dim"]]
+    act_mean: Callable[..., Float[Array, "K action_dim"]]
+
+
+def split_state(state: eqx.Module) -> tuple[Arrays, Any]:
+    """Split an agent's state into its arrays and what is static."""
+    arrays, static = eqx.partition(state, eqx.is_array)
+    return arrays, static
+
+
+def compile_learner(agent: ModuleType, static: Any, config: TrainConfig, spec: EnvSpec) -> Learner:
+    """Return the agent's compiled functions; each is traced once for the run's shapes."""
+
+    def train(
+        arrays: Arrays, totals: Metrics, replay: ReplayState, key: Key[Array, ""], updates: Any
+    ) -> tuple[Arrays, Metrics]:
+        def one(carry: tuple[Arrays, Metrics], count: Any) -> tuple[tuple[Arrays, Metrics], None]:
+            arrays, totals = carry
+            sample_key, update_key = jax.random.split(jax.random.fold_in(key, count))
+            batch = buffer.sample(replay, spec, config.relabel, config.batch_size, sample_key)
+            state, metrics = agent.update(eqx.combine(arrays, static), batch, update_key)
+            return (split_state(state)[0], jax.tree.map(jnp.add, totals, metrics)), None
+
+        counts = updates + jnp.arange(config.updates_per_call)
+        return jax.lax.scan(one, (arrays, totals), counts)[0]
+
+    def act(
+        arrays: Arrays, observation: Any, goal: Any, key: Key[Array, ""], *, explore: bool
+    ) -> Float[Array, "K action_dim"]:
+        actions: Float[Array, "K action_dim"] = agent.act(
+            eqx.combine(arrays, static), observation, goal, key, explore
+        )
+        return actions
+
+    return Learner(
+        train=jax.jit(train, donate_argnums=(0, 1)),
+        act=jax.jit(partial(act, explore=True)),
+        act_mean=jax.jit(partial(act, explore=False)),
+    )
+
+
+def empty_totals(
+    agent: ModuleType, arrays: Arrays, static: Any, config: TrainConfig, replay: ReplayState
+) -> Metrics:
+    """Return zeros for the sums of every scalar that an update reports."""
+    spec = static.spec
+
+    def metrics(arrays: Arrays, replay: ReplayState, key: Key[Array, ""]) -> Metrics:
+        batch = buffer.sample(replay, spec, config.relabel, config.batch_size, key)
+        logged: Metrics = agent.update(eqx.combine(arrays, static), batch, key)[1]
+        return logged
+
+    shapes = jax.eval_shape(metrics, arrays, replay, jax.random.key(0))
+    return {name: jnp.zeros(shape.shape, shape.dtype) for name, shape in shapes.items()}
+
+
+begin = jax.jit(buffer.begin, donate_argnums=0)
+"""Start episodes in place (`midway.replay.buffer.begin`)."""
+
+add = jax.jit(buffer.add, donate_argnums=0)
+"""Append steps in place (`midway.replay.buffer.add`)."""
