@@ -29,6 +29,9 @@ START_JOINTS = (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0)
 YAWS = (0.0, math.pi, math.pi / 2, -math.pi / 2)
 """The headings of starts and goals (rad)."""
 
+TORSO_RADIUS = 0.25
+"""Radius of the torso (m)."""
+
 LEGS = (
     ("front-left", (1, 1), (-1, 1), (30, 70)),
     ("front-right", (-1, 1), (1, 1), (-70, -30)),
@@ -91,7 +94,7 @@ def ant_model(maze: Maze) -> mujoco.MjModel:
         {walls}
         <body name="torso" pos="0 0 {START_HEIGHT}">
           <joint name="root" type="free" armature="0" damping="0" margin="0.01" limited="false"/>
-          <geom name="torso" type="sphere" size="0.25"/>
+          <geom name="torso" type="sphere" size="{TORSO_RADIUS}"/>
           {legs}
         </body>
       </worldbody>
@@ -133,6 +136,8 @@ class AntMazeVectorEnv(MazeVectorEnv):
     Raises:
         ConfigurationError: An unknown task, or no copies.
     """
+
+    body_radius = TORSO_RADIUS
 
     def __init__(
         self, maze: str, num_envs: int = 1, task: str = "uniform", num_threads: int = 0

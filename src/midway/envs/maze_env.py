@@ -42,6 +42,8 @@ class MazeVectorEnv(SimulationVectorEnv):
     """
 
     option_names = (*SimulationVectorEnv.option_names, "start", "goal")
+    body_radius: float
+    """Radius of the robot's solid middle (m), which no start or goal can have in a wall."""
 
     def __init__(
         self,
@@ -123,8 +125,10 @@ class MazeVectorEnv(SimulationVectorEnv):
             raise ConfigurationError(
                 f"{role} {points!r}: must be an x-y position, or one for each copy"
             ) from None
-        if not self.maze.free(points, radius=0).all():
-            raise ConfigurationError(f"{role} {points.tolist()}: in a wall or outside the maze")
+        if not self.maze.free(points, self.body_radius).all():
+            raise ConfigurationError(
+                f"{role} {points.tolist()}: must be in the maze and {self.body_radius} m from walls"
+            )
         return list(points)
 
 

@@ -100,10 +100,10 @@ class Maze:
         """The four walls, 2 m thick, around the arena."""
         half_x, half_y = self.arena.half_x, self.arena.half_y
         return (
-            Rectangle(0, half_y + 1, half_x, 1),
-            Rectangle(0, -half_y - 1, half_x, 1),
-            Rectangle(half_x + 1, 0, 1, half_y + 2),
-            Rectangle(-half_x - 1, 0, 1, half_y + 2),
+            Rectangle(0.0, half_y + 1, half_x, 1.0),
+            Rectangle(0.0, -half_y - 1, half_x, 1.0),
+            Rectangle(half_x + 1, 0.0, 1.0, half_y + 2),
+            Rectangle(-half_x - 1, 0.0, 1.0, half_y + 2),
         )
 
     @property
@@ -182,7 +182,7 @@ def _maze(
     numbered_goals: tuple[tuple[float, float], ...] = (),
 ) -> Maze:
     """Build a maze from its arena's half size, walls, and lower left corners of the test boxes."""
-    arena = Rectangle(0, 0, *half)
+    arena = Rectangle(0.0, 0.0, *half)
     cases = {"uniform": Case(arena, arena), "hard": Case(_test_box(*start), _test_box(*goal))}
     for number, corner in enumerate(numbered_goals, start=10):
         cases[f"case-{number}"] = Case(_test_box(*start), _test_box(*corner))
@@ -192,8 +192,8 @@ def _maze(
 _U = _maze(
     "u",
     "U-shaped",
-    half=(3.75, 9),
-    inner_walls=(Rectangle(0, 1.5, 0.75, 7.5),),
+    half=(3.75, 9.0),
+    inner_walls=(Rectangle(0.0, 1.5, 0.75, 7.5),),
     start=(-2.5, 7.25),
     goal=(2.0, 7.25),
 )
@@ -201,7 +201,7 @@ _U = _maze(
 _S = _maze(
     "s",
     "S-shaped",
-    half=(6, 6),
+    half=(6.0, 6.0),
     inner_walls=(Rectangle(-2.25, 1.5, 0.75, 4.5), Rectangle(2.25, -1.5, 0.75, 4.5)),
     start=(-4.75, 4.25),
     goal=(4.25, -4.75),
@@ -220,13 +220,13 @@ _S = _maze(
 _PI = _maze(
     "pi",
     "Π-shaped",
-    half=(8, 8),
+    half=(8.0, 8.0),
     inner_walls=(
         Rectangle(2.375, 3.25, 1.625, 0.75),
         Rectangle(-2.375, 3.25, 1.625, 0.75),
-        Rectangle(0, 2, 0.75, 6),
-        Rectangle(6, -2.25, 2, 0.75),
-        Rectangle(-6, -2.25, 2, 0.75),
+        Rectangle(0.0, 2.0, 0.75, 6.0),
+        Rectangle(6.0, -2.25, 2.0, 0.75),
+        Rectangle(-6.0, -2.25, 2.0, 0.75),
     ),
     start=(-2.5, 6.25),
     goal=(2.0, 6.25),
@@ -235,12 +235,12 @@ _PI = _maze(
 _OMEGA = _maze(
     "omega",
     "ω-shaped",
-    half=(8, 8),
+    half=(8.0, 8.0),
     inner_walls=(
-        Rectangle(0, -3.25, 3, 0.75),
-        Rectangle(-3.75, 0, 0.75, 4),
-        Rectangle(3.75, 0, 0.75, 4),
-        Rectangle(0, -6, 0.75, 2),
+        Rectangle(0.0, -3.25, 3.0, 0.75),
+        Rectangle(-3.75, 0.0, 0.75, 4.0),
+        Rectangle(3.75, 0.0, 0.75, 4.0),
+        Rectangle(0.0, -6.0, 0.75, 2.0),
     ),
     start=(-2.5, -6.75),
     goal=(2.0, -6.75),

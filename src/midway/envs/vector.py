@@ -199,7 +199,7 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
     ) -> dict[str, Any]:
         """Return info in Gymnasium's form: a value per copy and, as ``_name``, who has it."""
         info = {
-            "distance": self.goal_spec.task.distance(achieved, desired),
+            "distance": self.goal_spec.task.distance(achieved, desired).astype(np.float64),
             "is_success": reached.copy(),
             "elapsed_steps": self._elapsed.copy(),
         }
