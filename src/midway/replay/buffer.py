@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from midway.replay.relabel import draw_states, draw_transitions, goal_rows
+from midway.replay.relabel import Rows, draw, goal_rows, source_counts
 from midway.replay.storage import (
     ReplayState,
     allocate,
@@ -95,12 +95,14 @@ def sample(
     Candidates are states drawn uniformly and independently of the transitions. There must be at
     least one transition (``num_transitions``); an empty replay gives a batch without meaning.
     """
-    pair_key, goal_key, candidate_key = jax.random.split(key, 3)
-    pairs = draw_transitions(replay, batch_size, pair_key)
+    draw_key, goal_key = jax.random.split(key)
+    _, num_random, _ = source_counts(mix, batch_size)
+    has_next = jnp.arange(2 * batch_size + num_random) < batch_size
+    pairs, states, others = _split(
+        draw(replay, has_next, draw_key), batch_size, batch_size + num_random
+    )
     current, following = (pairs.lane, pairs.position), (pairs.lane, pairs.position + 1)
-    goal = goal_rows(replay, pairs, mix, goal_key)
-    states = draw_states(replay, batch_size, candidate_key)
-    candidate = (states.lane, states.position)
+    candidate, goal = (others.lane, others.position), goal_rows(pairs, states, mix, goal_key)
 
     goals = "observation" if spec.goal_is_observation else "achieved_goal"
     truth = goals if spec.state_shape is None else "achieved_state"
@@ -168,3 +170,9 @@ def _goal_row(replay: ReplayState, observation: Observation) -> Mapping[str, Any
     if "achieved_state" in replay.rows:
         row["achieved_state"] = observation["desired_state"]
     return row
+
+
+def _split(rows: Rows, *ends: int) -> list[Rows]:
+    """Split drawn rows into blocks at these ends."""
+    blocks = zip(*(jnp.split(leaf, ends) for leaf in rows), strict=True)
+    return [Rows(*block) for block in blocks]

@@ -1,13 +1,12 @@
 """Which rows make a batch: pure functions on positions (appendix B, experience relabelling)."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, Key
+from jaxtyping import Array, Bool, Int, Key, UInt32
 
-from midway.replay.storage import Live, ReplayState, bounds, live
+from midway.replay.storage import ReplayState, bounds, live
 from midway.types import RelabelMix
 
 
@@ -26,65 +25,44 @@ class Rows(NamedTuple):
     first: Int[Array, " B"]
     last: Int[Array, " B"]
 
-    @property
-    def is_state(self) -> Bool[Array, " B"]:
-        """Whether the row holds a state, not a goal."""
-        return self.position > self.first
 
-    @property
-    def is_transition(self) -> Bool[Array, " B"]:
-        """Whether the row holds a state that has a successor."""
-        return self.is_state & (self.position < self.last)
+def draw(replay: ReplayState, has_next: Bool[Array, " B"], key: Key[Array, ""]) -> Rows:
+    """Return independent rows, each uniform over all states; over those with a next if asked.
 
-
-def draw_transitions(replay: ReplayState, batch_size: int, key: Key[Array, ""]) -> Rows:
-    """Return rows drawn uniformly from all states that have a successor."""
-    available = live(replay)
-    return _draw(
-        replay, available, available.transitions, lambda rows: rows.is_transition, batch_size, key
-    )
-
-
-def draw_states(replay: ReplayState, batch_size: int, key: Key[Array, ""]) -> Rows:
-    """Return rows drawn uniformly from all states."""
-    available = live(replay)
-    return _draw(replay, available, available.states, lambda rows: rows.is_state, batch_size, key)
-
-
-def _draw(
-    replay: ReplayState,
-    available: Live,
-    wanted_per_lane: Int[Array, " K"],
-    is_wanted: Callable[[Rows], Bool[Array, " B"]],
-    batch_size: int,
-    key: Key[Array, ""],
-) -> Rows:
-    """Draw lanes by their number of wanted rows, then live rows of the lane until wanted.
-
-    Both steps are uniform over the wanted rows, so their product is. At least every fifth live row
-    of a lane with transitions is one, so few rounds are needed; none if nothing is wanted at all.
+    Draws a lane by its number of such rows, then any live row of that lane until it is one: both
+    steps are uniform, so their product is. Of the live rows of a lane with a transition at least
+    every fifth is one, so few rounds are needed. All rows are drawn in one loop, which compiles and
+    runs faster than one loop for each use. Without any transition the rows have no meaning.
     """
-    lane_key, key = jax.random.split(key)
-    ends = jnp.cumsum(wanted_per_lane)
-    ticket = jax.random.randint(lane_key, (batch_size,), 0, jnp.maximum(ends[-1], 1))
-    lane = jnp.sum(ticket[:, None] >= ends[:-1], axis=1, dtype=jnp.int32)
+    available = live(replay)
+    ends = jnp.cumsum(available.states), jnp.cumsum(available.transitions)
+    ticket, number = jax.random.bits(jax.random.fold_in(key, 0), (2, *has_next.shape))
+    ticket = below(ticket, jnp.where(has_next, ends[1][-1], ends[0][-1]))
+    lane_ends = jnp.where(has_next[:, None], ends[1], ends[0])
+    lane = jnp.sum(ticket[:, None] >= lane_ends[:, :-1], axis=1, dtype=jnp.int32)
 
-    def propose(key: Key[Array, ""]) -> Rows:
-        offset = jax.random.randint(key, (batch_size,), 0, available.rows[lane])
-        position = available.start[lane] + offset
+    def propose(number: UInt32[Array, " B"]) -> Rows:
+        position = available.start[lane] + below(number, available.rows[lane])
         return Rows(lane, position, *bounds(replay, lane, position))
 
-    def redraw(carry: tuple[Rows, Key[Array, ""]]) -> tuple[Rows, Key[Array, ""]]:
-        rows, key = carry
-        round_key, key = jax.random.split(key)
-        keep = is_wanted(rows)
-        return jax.tree.map(lambda a, b: jnp.where(keep, a, b), rows, propose(round_key)), key
+    def wanted(rows: Rows) -> Bool[Array, " B"]:
+        return (rows.first < rows.position) & (rows.position + has_next <= rows.last)
 
-    def unfinished(carry: tuple[Rows, Key[Array, ""]]) -> Bool[Array, ""]:
-        return (ends[-1] > 0) & ~jnp.all(is_wanted(carry[0]))
+    def redraw(carry: tuple[Rows, Int[Array, ""]]) -> tuple[Rows, Int[Array, ""]]:
+        rows, attempt = carry
+        keep = wanted(rows)
+        new = propose(jax.random.bits(jax.random.fold_in(key, attempt), has_next.shape))
+        return jax.tree.map(lambda old, new: jnp.where(keep, old, new), rows, new), attempt + 1
 
-    first_key, key = jax.random.split(key)
-    return jax.lax.while_loop(unfinished, redraw, (propose(first_key), key))[0]
+    def unfinished(carry: tuple[Rows, Int[Array, ""]]) -> Bool[Array, ""]:
+        return (ends[1][-1] > 0) & ~jnp.all(wanted(carry[0]))
+
+    return jax.lax.while_loop(unfinished, redraw, (propose(number), jnp.int32(1)))[0]
+
+
+def below(number: UInt32[Array, " B"], bound: Int[Array, " B"]) -> Int[Array, " B"]:
+    """Return 32 random bits modulo the bound: uniform up to a share of bound / 2**32."""
+    return (number % jnp.maximum(bound, 1).astype(jnp.uint32)).astype(jnp.int32)
 
 
 def source_counts(mix: RelabelMix, batch_size: int) -> tuple[int, int, int]:
@@ -101,20 +79,16 @@ def source_counts(mix: RelabelMix, batch_size: int) -> tuple[int, int, int]:
 
 
 def goal_rows(
-    replay: ReplayState, pairs: Rows, mix: RelabelMix, key: Key[Array, ""]
+    pairs: Rows, states: Rows, mix: RelabelMix, key: Key[Array, ""]
 ) -> tuple[Int[Array, " B"], Int[Array, " B"]]:
     """Return lane and position of the row that holds the goal of each drawn transition.
 
     The batch is split into one block for each source; transitions are independent draws, so this
-    favours none. Future goals are uniform over the later states of the episode, the transition's
-    own next state included.
+    favours none. Random goals are the drawn ``states``. Future goals are uniform over the later
+    states of the episode, the transition's own next state included.
     """
-    own, random, _ = source_counts(mix, pairs.lane.shape[0])
-    random_key, future_key = jax.random.split(key)
-    states = draw_states(replay, random, random_key)
+    own, random, num_future = source_counts(mix, pairs.lane.shape[0])
     future = jax.tree.map(lambda leaf: leaf[own + random :], pairs)
-    later = jax.random.randint(
-        future_key, future.position.shape, future.position + 1, future.last + 1
-    )
+    steps = 1 + below(jax.random.bits(key, (num_future,)), future.last - future.position)
     lane = jnp.concatenate([pairs.lane[:own], states.lane, future.lane])
-    return lane, jnp.concatenate([pairs.first[:own], states.position, later])
+    return lane, jnp.concatenate([pairs.first[:own], states.position, future.position + steps])
