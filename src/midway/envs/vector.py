@@ -120,6 +120,7 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
         for copy in copies:
             if seeds[copy] is not None:
                 self.generators[copy] = np_random(seeds[copy])[0]
+        self._ended[mask] = True  # should beginning fail, no copy goes on half begun
         self._begin(copies, options)
         self._elapsed[mask] = 0
         self._ended[mask] = False
@@ -167,6 +168,11 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
         """Return what success is measured on: the states where there are any, else the goals."""
         kind = "goal" if self.goal_spec.state_shape is None else "state"
         return observations[f"achieved_{kind}"], observations[f"desired_{kind}"]
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The generator of each copy, as Gymnasium's own vector environments give them."""
+        return tuple(self.generators)
 
     def state_dict(self) -> dict[str, Array]:
         """Return all that the future depends on, as arrays of numbers."""
