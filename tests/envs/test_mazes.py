@@ -131,6 +131,7 @@ def test_distance_is_infinite_from_and_to_walls():
     assert np.isinf(geodesic_distance(maze, np.array((20.0, 0.0)), free))
 
 
+@settings(deadline=None)
 @given(mazes, unit, st.floats(0, 1.2))
 def test_free_points_are_those_outside_the_grown_walls(maze, share, radius):
     point = in_arena(maze, share)
@@ -139,6 +140,7 @@ def test_free_points_are_those_outside_the_grown_walls(maze, share, radius):
     assert maze.free(point, radius) == (depth < 0)
 
 
+@settings(deadline=None)
 @given(mazes, st.integers(0, 2**32), st.floats(0, 1.25))
 def test_sampled_points_are_free_and_in_their_box(maze, seed, radius):
     rng = np.random.default_rng(seed)
@@ -148,7 +150,7 @@ def test_sampled_points_are_free_and_in_their_box(maze, seed, radius):
         assert depth_in_walls(maze, point) <= (-radius if case.goal == maze.arena else -0.75) + 1e-9
 
 
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 @given(mazes, st.integers(0, 2**32))
 def test_shortest_paths_are_a_metric(maze, seed):
     rng = np.random.default_rng(seed)
@@ -167,6 +169,7 @@ def test_shortest_paths_are_a_metric(maze, seed):
         assert ab > np.linalg.norm(b - a)
 
 
+@settings(deadline=None)
 @given(mazes, st.integers(0, 2**32))
 def test_start_and_goal_keep_apart(maze, seed):
     rng = np.random.default_rng(seed)

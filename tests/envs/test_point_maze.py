@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 
 from midway.envs.geodesic import geodesic_distance
 from midway.envs.mazes import MAZES
@@ -97,5 +98,8 @@ def test_an_episode_that_stands_still_is_cut_off_at_its_limit():
 @pytest.mark.parametrize("point", [(0.0, 0.0), (30.0, 0.0), (1.0, 2.0, 3.0)])
 def test_a_start_in_a_wall_is_refused(point):
     env = make_vec("point-u", 2)
+    env.reset(seed=0)
     with pytest.raises(ConfigurationError, match="start"):
         env.reset(options={"start": point})
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros((2, 2)))

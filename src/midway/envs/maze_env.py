@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float, Float32, Int
 
-from midway.envs.mazes import ROBOT_RADIUS, WALL_HEIGHT, Maze
+from midway.envs.mazes import WALL_HEIGHT, Maze
 from midway.envs.simulation import SimulationVectorEnv
 from midway.envs.vector import Array, Observations
 from midway.types import ConfigurationError, DistanceTask, EnvSpec
@@ -146,6 +146,3 @@ def walls_mjcf(maze: Maze, inner: str, outer: str) -> str:
         )
         for number, wall in enumerate(walls, start=1)
     )
-
-
-__all__ = ["GOAL_THRESHOLD", "ROBOT_RADIUS", "MazeVectorEnv", "walls_mjcf"]
