@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
-from jaxtyping import Array, Bool, Float, Key, Shaped
+from jaxtyping import Array, Bool, Float, Key, PyTree, Shaped
 
 Metrics: TypeAlias = dict[str, Float[Array, ""]]
 """Scalars on the device, named ``group/name``."""
@@ -108,8 +108,19 @@ class Subgoal(NamedTuple):
     achieved_goal: Shaped[Array, "B ..."]
 
 
+class Outcome(NamedTuple):
+    """What success is measured on: the goals, or the true states where the goals are images."""
+
+    achieved: Float[Array, "B D"]
+    desired: Float[Array, "B D"]
+
+
 class Batch(NamedTuple):
-    """Relabelled transitions; reward and terminated belong to ``goal``."""
+    """Relabelled transitions; reward and terminated belong to ``goal``.
+
+    ``outcome`` is what they were computed from; ``None`` where that is ``next_observation`` and
+    ``goal``.
+    """
 
     observation: Shaped[Array, "B ..."]
     action: Float[Array, "B action_dim"]
@@ -118,6 +129,7 @@ class Batch(NamedTuple):
     next_observation: Shaped[Array, "B ..."]
     goal: Shaped[Array, "B ..."]
     subgoal_candidate: Subgoal
+    outcome: Outcome | None = None
 
 
 @dataclass(frozen=True)
@@ -171,6 +183,66 @@ class Agent(Protocol[Config, State]):
         explore: bool,
     ) -> Float[Array, "B action_dim"]:
         """Return actions in [-1, 1]: sampled where ``explore``, else the tanh of the mean."""
+        ...
+
+
+Memory: TypeAlias = PyTree
+"""What an agent remembers of running episodes: arrays with one row for each."""
+
+
+@runtime_checkable
+class Remembering(Protocol):
+    """What an agent adds if it remembers something from one step of an episode to the next.
+
+    Its ``act`` is then that of an episode's first step.
+    """
+
+    def begin(self, state: Any, num_episodes: int) -> Memory:
+        """Return what is remembered before the first step of each episode."""
+        ...
+
+    def act_on(
+        self,
+        state: Any,
+        memory: Memory,
+        observation: Shaped[Array, "B ..."],
+        goal: Shaped[Array, "B ..."],
+        key: Key[Array, ""],
+        explore: bool,
+    ) -> tuple[Float[Array, "B action_dim"], Memory]:
+        """Return actions in [-1, 1], and what to remember until the next step."""
+        ...
+
+
+@dataclass(frozen=True)
+class Pretraining:
+    """What an agent learns from states of the environment before the first update.
+
+    Attributes:
+        networks: Parts of the agent's state that this trains; they are saved and can be reused.
+        states: Number of states.
+        random_actions: Actions taken after each reset; the state after each of them is used.
+        rounds: Calls of ``pretrain``.
+        source: Run folder whose networks are taken instead, or nothing.
+    """
+
+    networks: tuple[str, ...]
+    states: int
+    random_actions: int
+    rounds: int
+    source: str = ""
+
+
+@runtime_checkable
+class Pretrained(Protocol):
+    """What an agent adds if it learns from states of the environment before the first update."""
+
+    def pretraining(self, config: Any) -> Pretraining:
+        """Return how much there is to learn."""
+        ...
+
+    def pretrain(self, state: Any, states: Subgoal, key: Key[Array, ""]) -> tuple[Any, Metrics]:
+        """Return the agent's state after one round on these states, and scalars to log."""
         ...
 
 

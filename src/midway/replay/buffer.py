@@ -22,7 +22,15 @@ from midway.replay.storage import (
     read,
     write,
 )
-from midway.types import Batch, ConfigurationError, EnvSpec, Observation, RelabelMix, Subgoal
+from midway.types import (
+    Batch,
+    ConfigurationError,
+    EnvSpec,
+    Observation,
+    Outcome,
+    RelabelMix,
+    Subgoal,
+)
 
 
 def create(spec: EnvSpec, capacity: int, num_lanes: int) -> ReplayState:
@@ -106,7 +114,8 @@ def sample(
 
     goals = "observation" if spec.goal_is_observation else "achieved_goal"
     truth = goals if spec.state_shape is None else "achieved_state"
-    reward, terminated = spec.task(read(replay, truth, *following), read(replay, truth, *goal))
+    outcome = Outcome(read(replay, truth, *following), read(replay, truth, *goal))
+    reward, terminated = spec.task(*outcome)
     return Batch(
         observation=read(replay, "observation", *current),
         action=read(replay, "action", *current),
@@ -117,6 +126,7 @@ def sample(
         subgoal_candidate=Subgoal(
             read(replay, "observation", *candidate), read(replay, goals, *candidate)
         ),
+        outcome=None if truth == "observation" else outcome,
     )
 
 
