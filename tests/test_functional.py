@@ -261,6 +261,19 @@ def test_densities_keep_leading_axes():
     assert functional.tanh_log_determinant(x).shape == (5, 10)
 
 
+@pytest.mark.parametrize(
+    "log_density", [functional.gaussian_log_density, functional.laplace_log_density]
+)
+def test_densities_broadcast_one_action_against_the_subgoals(log_density):
+    """An action (B, 1, A) against the ten distributions (B, 10, A) of eq. 18."""
+    rng = np.random.default_rng(0)
+    x = jnp.asarray(rng.normal(size=(5, 1, 3)), jnp.float32)
+    location = jnp.asarray(rng.normal(size=(5, 10, 3)), jnp.float32)
+    together = log_density(x, location, 0.1 * location)
+    apart = log_density(jnp.tile(x, (1, 10, 1)), location, 0.1 * location)
+    np.testing.assert_allclose(together, apart, rtol=1e-6)
+
+
 def test_tanh_log_determinant_by_hand():
     """The derivative of tanh is 1 - tanh²: 1 at 0, 3/4 where tanh is 1/2."""
     half = float(np.arctanh(0.5))

@@ -100,7 +100,7 @@ def copy(network: Tree) -> Tree:
 
 
 def gaussian_log_density(
-    x: Float[Array, "*B D"], mean: Float[Array, "*B D"], log_std: Float[Array, "*B D"]
+    x: Float[Array, "*#B D"], mean: Float[Array, "*#B D"], log_std: Float[Array, "*#B D"]
 ) -> Float[Array, "*B"]:
     """Return the log-density of a diagonal Gaussian, summed over the last axis."""
     z = (x - mean) * jnp.exp(-log_std)
@@ -108,7 +108,7 @@ def gaussian_log_density(
 
 
 def laplace_log_density(
-    x: Float[Array, "*B D"], location: Float[Array, "*B D"], log_scale: Float[Array, "*B D"]
+    x: Float[Array, "*#B D"], location: Float[Array, "*#B D"], log_scale: Float[Array, "*#B D"]
 ) -> Float[Array, "*B"]:
     """Return the log-density of independent Laplace variables, summed over the last axis."""
     return (-jnp.abs(x - location) * jnp.exp(-log_scale) - log_scale - jnp.log(2.0)).sum(-1)

@@ -26,8 +26,8 @@ class Gaussian(NamedTuple):
         """Return mean + std * noise, the reparametrised pre-tanh action."""
         return self.mean + jnp.exp(self.log_std) * noise
 
-    def log_density(self, pre_tanh: Float[Array, "*B A"]) -> Float[Array, "*B"]:
-        """Return the log-density of pre-tanh actions."""
+    def log_density(self, pre_tanh: Float[Array, "*#B A"]) -> Float[Array, "*#B"]:
+        """Return the log-density of pre-tanh actions, broadcast against the distributions."""
         return gaussian_log_density(pre_tanh, self.mean, self.log_std)
 
 
@@ -43,8 +43,8 @@ class Laplace(NamedTuple):
         noise = jax.random.laplace(key, shape)
         return self.location[..., None, :] + jnp.exp(self.log_scale)[..., None, :] * noise
 
-    def log_density(self, subgoal: Float[Array, "*B S"]) -> Float[Array, "*B"]:
-        """Return the log-density of subgoals."""
+    def log_density(self, subgoal: Float[Array, "*#B S"]) -> Float[Array, "*#B"]:
+        """Return the log-density of subgoals, broadcast against the distributions."""
         return laplace_log_density(subgoal, self.location, self.log_scale)
 
 
