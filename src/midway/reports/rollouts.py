@@ -1,0 +1,100 @@
+"""Episodes of a saved policy, recorded step by step."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from midway.envs import registry as environments
+from midway.reports.runs import RunData
+from midway.training import policy as policies
+from midway.training.policy import Policy
+
+Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
+
+SEED = 20_210_718
+"""Seed of starts and goals in figures: the same for every run, and met in no training."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One episode.
+
+    Attributes:
+        task: What start and goal were drawn from.
+        observations: ``(T + 1, ...)``, from the start to the last state.
+        achieved: Achieved goals ``(T + 1, ...)``.
+        goal: The desired goal.
+        success: Whether the goal was reached.
+        final_distance: Distance to the goal at the end (m).
+    """
+
+    task: str
+    observations: Array
+    achieved: Array
+    goal: Array
+    success: bool
+    final_distance: float
+
+    @property
+    def length(self) -> int:
+        """Steps taken."""
+        return len(self.observations) - 1
+
+
+def load(run: RunData) -> Policy:
+    """Return the saved policy of a run.
+
+    Raises:
+        ConfigurationError: The policy is missing, damaged or foreign.
+    """
+    return policies.load(run.folder, environments.make_vec(run.config.env).goal_spec)
+
+
+def record(policy: Policy, episodes: Mapping[str, int], seed: int = SEED) -> list[Recording]:
+    """Run episodes with mean actions, all at once.
+
+    Args:
+        policy: The policy, in the environment that it was trained for.
+        episodes: Number of episodes of each task.
+        seed: The same seed gives the same starts and goals.
+    """
+    tasks = np.repeat(list(episodes), list(episodes.values()))
+    env = environments.make_vec(policy.config.env, num_envs=len(tasks))
+    observation = _reset(env, tasks, seed)
+    goals = observation["desired_goal"].copy()
+    states = [{name: observation[name].copy() for name in ("observation", "achieved_goal")}]
+    ends: dict[int, tuple[int, bool, float]] = {}
+    while len(ends) < len(tasks):
+        action = policy(observation["observation"], observation["desired_goal"])
+        observation, _, terminated, truncated, info = env.step(action)
+        states.append({name: observation[name].copy() for name in states[0]})
+        ended = terminated | truncated
+        for copy in np.flatnonzero(ended):
+            end = (len(states), bool(terminated[copy]), float(info["distance"][copy]))
+            ends.setdefault(int(copy), end)
+        if ended.any():
+            # Copies that are done go round again, unrecorded, until the last one has ended.
+            observation, _ = env.reset(options={"reset_mask": ended})
+    return [
+        Recording(
+            str(task),
+            np.stack([state["observation"][copy] for state in states[:length]]),
+            np.stack([state["achieved_goal"][copy] for state in states[:length]]),
+            goals[copy],
+            success,
+            distance,
+        )
+        for copy, task in enumerate(tasks)
+        for length, success, distance in [ends[copy]]
+    ]
+
+
+def _reset(env: Any, tasks: Array, seed: int) -> dict[str, Array]:
+    """Begin one episode in each copy, each with a task of its own."""
+    observation: dict[str, Array] = {}
+    for task in dict.fromkeys(tasks.tolist()):
+        options = {"task": task, "reset_mask": tasks == task}
+        observation, _ = env.reset(seed=seed, options=options)
+    return observation

@@ -1,0 +1,180 @@
+"""What run folders hold, read for figures."""
+
+import csv
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from midway.reports import style
+from midway.training.folder import RunConfig, RunFolder, read_json
+from midway.types import ConfigurationError
+
+Table: TypeAlias = dict[str, np.ndarray[Any, Any]]
+"""Columns by name: float64, or text for the columns of ``TEXT_COLUMNS``."""
+
+TEXT_COLUMNS = ("task", "actions")
+
+
+@dataclass(frozen=True)
+class RunData:
+    """One run folder.
+
+    Attributes:
+        folder: Names of its files.
+        config: What was run.
+        record: All of ``config.json``: versions, commit, machine and command too.
+        metrics: Scalars of training; no columns before the first row.
+        evaluation: Evaluations; no columns before the first row.
+    """
+
+    folder: RunFolder
+    config: RunConfig
+    record: dict[str, Any]
+    metrics: Table
+    evaluation: Table
+
+    @property
+    def steps(self) -> int:
+        """The last environment step that the files tell of."""
+        tables = (self.metrics, self.evaluation)
+        return max((int(table["step"].max()) for table in tables if table), default=0)
+
+    @property
+    def finished(self) -> bool:
+        """Whether all configured steps were taken."""
+        return self.steps >= self.config.train.steps
+
+    @property
+    def has_policy(self) -> bool:
+        """Whether a policy was saved."""
+        return self.folder.policy_weights.exists() and self.folder.policy_config.exists()
+
+    @property
+    def name(self) -> str:
+        """The run in file names and lists."""
+        return f"{self.config.env}-{self.config.agent}-seed{self.config.seed}"
+
+    def evaluated(self, task: str, actions: str) -> Table:
+        """Return the evaluations of one task with one kind of action."""
+        if not self.evaluation:
+            return {}
+        chosen = (self.evaluation["task"] == task) & (self.evaluation["actions"] == actions)
+        return {name: column[chosen] for name, column in self.evaluation.items()}
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that differ in their seed only.
+
+    Attributes:
+        label: Name in legends, such as ``RIS``.
+        colour: Its colour in every figure.
+        marker: Its mark in every figure.
+        runs: The runs, by seed.
+    """
+
+    label: str
+    colour: str
+    marker: str
+    runs: tuple[RunData, ...]
+
+    @property
+    def agent(self) -> str:
+        """Name of the agent."""
+        return self.runs[0].config.agent
+
+    @property
+    def slug(self) -> str:
+        """The label in file names."""
+        kept = "".join(c if c.isalnum() or c in ".-" else " " for c in self.label.lower())
+        return "-".join(kept.split())
+
+
+def read(path: Path) -> RunData:
+    """Return what is in a run folder.
+
+    Raises:
+        ConfigurationError: It is no run folder, or damaged, or of another version.
+    """
+    folder = RunFolder(path)
+    config = folder.load_config()
+    record = read_json(folder.config_file)
+    return RunData(
+        folder,
+        config,
+        record,
+        read_table(folder.metrics_file),
+        read_table(folder.evaluation_file),
+    )
+
+
+def read_table(path: Path) -> Table:
+    """Return the columns of a CSV file; none if it is not there or has no rows.
+
+    A last line that is being written while we read is left out.
+
+    Raises:
+        ConfigurationError: The file holds something else.
+    """
+    if not path.exists():
+        return {}
+    try:
+        with path.open(newline="") as file:
+            header, *rows = list(csv.reader(file)) or [[]]
+        whole = [row for row in rows if len(row) == len(header)]
+        columns = dict(zip(header, zip(*whole, strict=True), strict=False))
+        return {
+            name: np.array(values) if name in TEXT_COLUMNS else np.array(values, np.float64)
+            for name, values in columns.items()
+        }
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"{path} cannot be read: {error}") from error
+
+
+def groups(runs: Sequence[RunData]) -> list[Group]:
+    """Return runs of one environment, grouped by everything but seed and number of steps."""
+    by_settings: dict[str, list[RunData]] = {}
+    for run in runs:
+        by_settings.setdefault(repr(_settings(run.config)), []).append(run)
+    gathered = sorted(by_settings.values(), key=lambda group: _order(group[0].config.agent))
+    colours = iter(style.SPARE_COLOURS * len(gathered))
+    found: list[Group] = []
+    for number, members in enumerate(gathered):
+        agent = members[0].config.agent
+        rivals = [other[0].config for other in gathered if other[0].config.agent == agent]
+        first = all(group.agent != agent for group in found)
+        colour = style.AGENT_COLOURS.get(agent) if first else None
+        found.append(
+            Group(
+                label=", ".join([agent.upper(), *_differences(members[0].config, rivals)]),
+                colour=colour or next(colours),
+                marker=style.MARKERS[number % len(style.MARKERS)],
+                runs=tuple(sorted(members, key=lambda run: run.config.seed)),
+            )
+        )
+    return found
+
+
+def _order(agent: str) -> int:
+    """Return the place of an agent in legends."""
+    known = list(style.AGENT_COLOURS)
+    return known.index(agent) if agent in known else len(known)
+
+
+def _settings(config: RunConfig) -> dict[str, Any]:
+    """Return all values that runs of one group share."""
+    train = dataclasses.asdict(config.train)
+    del train["steps"]
+    values = {**train, **dataclasses.asdict(config.hyperparameters)}
+    return {"agent": config.agent, "preset": config.preset, **values}
+
+
+def _differences(config: RunConfig, rivals: Sequence[RunConfig]) -> list[str]:
+    """Return the settings of this group that differ from another group of the same agent."""
+    mine = _settings(config)
+    others = [_settings(rival) for rival in rivals]
+    return [f"{name} {mine[name]}" for name in mine if any(o[name] != mine[name] for o in others)]

@@ -1,0 +1,89 @@
+"""How figures look: size, colours, labels. Drawn through matplotlib's objects, without pyplot."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+WIDTH = 9.0
+"""Width of a figure that fills a page (inches): 10-point text is still readable on a laptop."""
+
+RESOLUTION = 150
+"""Pixels per inch of PNG files."""
+
+TEXT, SMALL = 10.0, 8.5
+"""Sizes of titles and axis labels, and of everything else (points)."""
+
+INK, MUTED, GRID = "#222222", "#595959", "#e3e3e3"
+"""Colours of text, of secondary text (contrast 7:1 on white), and of lines behind the data."""
+
+BLUE, ORANGE, GREEN, VERMILION = "#0072b2", "#e69f00", "#009e73", "#d55e00"
+PURPLE, SKY, BLACK = "#cc79a7", "#56b4e9", "#000000"
+"""The palette of Okabe and Ito, which colour-blind readers can tell apart."""
+
+AGENT_COLOURS = {"ris": BLUE, "sac": VERMILION, "tdm": GREEN, "leap": PURPLE}
+"""The same agent has the same colour in every figure."""
+
+SPARE_COLOURS = (SKY, ORANGE, BLACK, PURPLE, GREEN)
+"""Colours of further groups of runs of the same agent."""
+
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+"""Marks that tell groups apart without colour."""
+
+
+def figure(
+    rows: int, columns: int, height: float, width: float = WIDTH, **options: Any
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure (inches) and its axes, row by row, in the style of the project."""
+    drawn = Figure((width, height), layout="constrained")
+    FigureCanvasAgg(drawn)
+    axes = list(np.ravel(drawn.subplots(rows, columns, squeeze=False, **options)))
+    for each in axes:
+        tidy(each)
+    return drawn, axes
+
+
+def tidy(axes: Axes) -> None:
+    """Show two spines, a pale grid behind the data, and small numbers."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(MUTED)
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=SMALL, color=MUTED, labelcolor=INK)
+
+
+def label(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
+    """Write the title, flush left, and the names of the axes with their units."""
+    axes.set_title(title, fontsize=TEXT, color=INK, loc="left", weight="bold")
+    axes.set_xlabel(x, fontsize=TEXT, color=INK)
+    axes.set_ylabel(y, fontsize=TEXT, color=INK)
+
+
+def success_axis(axes: Axes) -> None:
+    """Let y run from 0 to 100 % with room for the lines at both ends."""
+    axes.set_ylim(-0.03, 1.03)
+    axes.set_yticks(np.linspace(0, 1, 5), ["0 %", "25 %", "50 %", "75 %", "100 %"])
+
+
+def legend_below(drawn: Figure, handles: Sequence[Any], columns: int = 6) -> None:
+    """Put one legend under all panels."""
+    drawn.legend(
+        handles=list(handles),
+        loc="outside lower center",
+        ncols=min(columns, len(handles)),
+        frameon=False,
+        fontsize=SMALL + 0.5,
+        labelcolor=INK,
+    )
+
+
+def save(drawn: Figure, path: Path) -> list[Path]:
+    """Write ``path`` as PNG and as SVG; return both files."""
+    files = [path.with_name(path.name + suffix) for suffix in (".png", ".svg")]
+    drawn.savefig(files[0], dpi=RESOLUTION, facecolor="white")
+    drawn.savefig(files[1], dpi=RESOLUTION, facecolor="white", metadata={"Date": None})
+    return files
