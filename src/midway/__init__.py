@@ -1,5 +1,6 @@
 """Goal-conditioned reinforcement learning with imagined subgoals."""
 
+import importlib
 from typing import Any
 
 from midway.envs.ids import register_ids
@@ -7,10 +8,22 @@ from midway.envs.ids import register_ids
 register_ids()
 
 
+_PUBLIC = {
+    "train": "midway.training.api",
+    "resume": "midway.training.api",
+    "load": "midway.training.api",
+    "evaluate": "midway.training.api",
+    "make_vec": "midway.envs.registry",
+}
+
+
 def __getattr__(name: str) -> Any:
     """Import the public functions on first use, so that ``import midway`` stays quick."""
-    if name == "make_vec":
-        from midway.envs.registry import make_vec
-
-        return make_vec
+    if name in _PUBLIC:
+        return getattr(importlib.import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module 'midway' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Name the public functions too."""
+    return [*globals(), *_PUBLIC]

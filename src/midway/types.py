@@ -197,7 +197,7 @@ class Remembering(Protocol):
     Its ``act`` is then that of an episode's first step.
     """
 
-    def begin(self, state: Any, num_episodes: int) -> Memory:
+    def begin(self, config: Any, spec: EnvSpec, num_episodes: int) -> Memory:
         """Return what is remembered before the first step of each episode."""
         ...
 

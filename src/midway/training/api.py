@@ -3,11 +3,9 @@
 import ast
 import dataclasses
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from midway import presets
@@ -106,7 +104,7 @@ def train(
     given = {name: value for name, value in named.items() if value is not None}
     config = configure(env, agent, preset, seed, {**(changes or {}), **given})
     folder = RunFolder(Path(out or Path("runs") / f"{env}-{agent}-seed{seed}"))
-    training = _build(config, folder)
+    training = build(config, folder)
     folder.create(config)
     return _run(training, progress)
 
@@ -129,7 +127,7 @@ def resume(path: str | Path, steps: int | None = None, progress: bool = False) -
         config = dataclasses.replace(
             config, train=dataclasses.replace(config.train, steps=int(steps))
         )
-    return _run(_build(config, folder), progress)
+    return _run(build(config, folder), progress)
 
 
 def load(path: str | Path) -> Policy:
@@ -167,20 +165,14 @@ def evaluate(
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
     policy = load(path)
     env = environments.make_vec(policy.config.env, num_envs=episodes, task=task)
-    keys = map(partial(jax.random.fold_in, jax.random.key(seed)), iter(range(2**31)))
-
-    def act(observation: Any, goal: Any) -> Any:
-        if actions == "mean":
-            return policy(observation, goal)
-        return policy.sample(observation, goal, next(keys))
-
     # The seeds of training and its evaluations come from a hash; these must not meet them.
-    return run_episodes(
-        env, act, task, actions, int(np.random.SeedSequence((seed, 1)).generate_state(1)[0])
-    )
+    env_seed = int(np.random.SeedSequence((seed, 1)).generate_state(1)[0])
+    return run_episodes(env, policy.actor(actions, seed), task, actions, env_seed)
 
 
-def _build(config: RunConfig, folder: RunFolder) -> loop.Training:
+def build(config: RunConfig, folder: RunFolder) -> loop.Training:
+    """Return the run of this configuration at its start; nothing is written."""
+
     def make_env(num_envs: int, task: str) -> Any:
         return environments.make_vec(config.env, num_envs=num_envs, task=task)
 

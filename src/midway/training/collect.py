@@ -38,11 +38,13 @@ class Collector:
     Attributes:
         env: A vector environment without autoreset.
         observation: The newest observations of all copies.
+        begun: Copies in which the last step was followed by a new episode.
         counts: Episodes that ended since they were last reset.
     """
 
     env: Any
     observation: dict[str, Any]
+    begun: np.ndarray[Any, np.dtype[np.bool_]]
     counts: EpisodeCounts = field(default_factory=EpisodeCounts)
 
     @staticmethod
@@ -50,7 +52,7 @@ class Collector:
         """Reset every copy and begin its first episode in the replay."""
         observation, _ = env.reset(seed=seed)
         everyone = np.ones(env.num_envs, np.bool_)
-        return Collector(env, observation), step.begin(replay, observation, everyone)
+        return Collector(env, observation, everyone), step.begin(replay, observation, everyone)
 
     def step(self, replay: ReplayState, choose: Actions) -> ReplayState:
         """Take one step in every copy; begin new episodes where one has ended."""
@@ -65,6 +67,7 @@ class Collector:
             self.counts.length += int(info["elapsed_steps"][ended].sum())
             self.observation, _ = self.env.reset(options={"reset_mask": ended})
             replay = step.begin(replay, self.observation, ended)
+        self.begun = ended
         return replay
 
     def state_dict(self) -> dict[str, Any]:
@@ -89,4 +92,5 @@ class Collector:
                 f"the checkpoint does not fit the environment: {error}"
             ) from error
         counts = EpisodeCounts(**{name: int(value) for name, value in state["counts"].items()})
-        return Collector(env, dict(state["observation"]), counts)
+        nobody = np.zeros(env.num_envs, np.bool_)
+        return Collector(env, dict(state["observation"]), nobody, counts)

@@ -1,6 +1,7 @@
 """Rows for CSV files and TensorBoard."""
 
 import csv
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -78,13 +79,14 @@ class Logger:
         self._evaluation = Table(evaluation, until)
         self._events = SummaryWriter(str(events), purge_step=until + 1 if until else None)
 
-    def metrics(self, step: int, values: Mapping[str, float]) -> None:
-        """Write one row of scalars."""
-        self._metrics.write({"step": step, **values})
-        for name, value in values.items():
+    def metrics(self, step: int, values: Mapping[str, int | float]) -> None:
+        """Write one row of scalars; a value that is not a number is left out."""
+        known = {name: value for name, value in values.items() if not math.isnan(value)}
+        self._metrics.write({"step": step, **dict.fromkeys(values, ""), **known})
+        for name, value in known.items():
             self._events.add_scalar(name, value, step)
 
-    def evaluation(self, step: int, clock: Mapping[str, float], result: Evaluation) -> None:
+    def evaluation(self, step: int, clock: Mapping[str, int | float], result: Evaluation) -> None:
         """Write one row for an evaluated task and kind of action."""
         values = {
             "success_rate": result.success_rate,

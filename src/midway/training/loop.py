@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -17,6 +18,7 @@ import jax
 import numpy as np
 
 from midway.replay import buffer
+from midway.training import acting
 from midway.training import policy as policies
 from midway.training import step as steps_of
 from midway.training.arrays import named_arrays, with_named_arrays
@@ -62,6 +64,8 @@ class Training:
         self.arrays, self._static = steps_of.split_state(
             agent.create(config.hyperparameters, self.spec, network_key)
         )
+        self._begin = partial(acting.begin, agent, config.hyperparameters, self.spec)
+        self._fresh = self.memory = self._begin(train.num_envs)
         replay = buffer.create(self.spec, train.replay_capacity, train.num_envs)
         self.totals = steps_of.empty_totals(agent, self.arrays, self._static, train, replay)
         self._learner = steps_of.compile_learner(agent, self._static, train, self.spec)
@@ -79,6 +83,8 @@ class Training:
         """Take one step in every environment, then the updates that are due."""
         started = time.perf_counter()
         self.replay = self.collector.step(self.replay, self._choose)
+        if self.collector.begun.any():
+            self.memory = acting.renew(self.memory, self._fresh, self.collector.begun)
         self.steps += self.config.train.num_envs
         per_call = self.config.train.updates_per_call
         while self.config.train.updates_due(self.steps) - self.updates >= per_call:
@@ -95,11 +101,9 @@ class Training:
             shape = (self.config.train.num_envs, self.spec.action_dim)
             return generator.uniform(-1, 1, shape).astype(np.float32)
         key = jax.random.fold_in(self._act_key, self.steps)
-        return np.asarray(
-            self._learner.act(
-                self.arrays, observation["observation"], observation["desired_goal"], key
-            )
-        )
+        pair = observation["observation"], observation["desired_goal"]
+        actions, self.memory = self._learner.act(self.arrays, self.memory, *pair, key)
+        return np.asarray(actions)
 
     # --- what is looked at from time to time ------------------------------------------------------
 
@@ -131,21 +135,16 @@ class Training:
             for actions in EVALUATED_ACTIONS:
                 yield run_episodes(
                     self._evaluation_envs[task],
-                    self._policy(actions),
+                    self.policy(actions),
                     task,
                     actions,
                     self._evaluation_seed,
                 )
 
-    def _policy(self, actions: ActionKind) -> Callable[[Any, Any], Any]:
+    def policy(self, actions: ActionKind) -> Callable[[Any, Any], Any]:
+        """Return the current policy, for a batch of observations and goals."""
         act = self._learner.act_mean if actions == "mean" else self._learner.act
-        counter = iter(range(2**31))
-
-        def policy(observation: Any, goal: Any) -> Any:
-            key = jax.random.fold_in(self._evaluation_key, next(counter))
-            return act(self.arrays, observation, goal, key)
-
-        return policy
+        return acting.Actor(partial(act, self.arrays), self._begin, self._evaluation_key)
 
     # --- files ------------------------------------------------------------------------------------
 
@@ -158,7 +157,9 @@ class Training:
             "training_seconds": self.training_seconds,
             "seconds": self.seconds,
         }
+        memory = named_arrays(self.memory)
         return {
+            **({"memory": memory} if memory else {}),
             "agent": named_arrays(self.arrays),
             "totals": self.totals,
             "replay": named_arrays(self.replay),
@@ -169,6 +170,7 @@ class Training:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a ``state_dict``, bit for bit."""
         self.arrays = with_named_arrays(self.arrays, state["agent"])
+        self.memory = with_named_arrays(self.memory, state.get("memory", {}))
         self.totals = state["totals"]
         self.replay = with_named_arrays(self.replay, state["replay"])
         self.collector = Collector.restore(self.collector.env, state["collector"])
@@ -226,7 +228,7 @@ def run(training: Training, checkpoints: Checkpoints, logger: Logger, reporter: 
     return training.steps >= train.steps
 
 
-def _clock(training: Training) -> dict[str, float]:
+def _clock(training: Training) -> dict[str, int | float]:
     return {
         "updates": training.updates,
         "seconds": round(training.seconds, 3),

@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -12,7 +13,9 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from midway.agents import registry
+from midway.training import acting
 from midway.training.arrays import named_arrays, with_named_arrays
+from midway.training.evaluate import ActionKind
 from midway.training.folder import FORMAT, RunConfig, RunFolder, read_json, write_json
 from midway.types import ConfigurationError, EnvSpec
 
@@ -31,7 +34,7 @@ class Policy:
     state: Any
     config: RunConfig
 
-    def __call__(self, observation: Any, goal: Any) -> np.ndarray[Any, Any]:
+    def __call__(self, observation: Any, goal: Any) -> np.ndarray[Any, np.dtype[Any]]:
         """Return the tanh of the mean action, ``(action_dim,)`` or ``(B, action_dim)``.
 
         Args:
@@ -45,9 +48,26 @@ class Policy:
         actions = np.asarray(_mean_action(self.agent, self.state, observation, goal))
         return actions[0] if single else actions
 
-    def sample(self, observation: Any, goal: Any, key: Any) -> np.ndarray[Any, Any]:
+    def sample(self, observation: Any, goal: Any, key: Any) -> np.ndarray[Any, np.dtype[Any]]:
         """Return sampled actions ``(B, action_dim)`` for batches."""
         return np.asarray(_sampled_action(self.agent, self.state, observation, goal, key))
+
+    def actor(self, actions: ActionKind = "mean", seed: int = 0) -> acting.Actor:
+        """Return the policy as one that remembers its episodes, from their first step on.
+
+        An agent that remembers nothing acts in the same way without. Others plan anew or start
+        their time anew on each call where this is not used.
+
+        Args:
+            actions: ``mean`` or ``sampled``.
+            seed: Seed of all draws.
+        """
+        act = partial(_act, self.agent, self.state, explore=actions == "sampled")
+        begin = partial(acting.begin, self.agent, self.config.hyperparameters, self.state.spec)
+        return acting.Actor(act, begin, jax.random.key(seed))
+
+
+_act = eqx.filter_jit(acting.act)
 
 
 @eqx.filter_jit

@@ -13,8 +13,9 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from midway.replay import buffer
 from midway.replay.storage import ReplayState
+from midway.training import acting
 from midway.training.config import TrainConfig
-from midway.types import EnvSpec, Metrics
+from midway.types import EnvSpec, Memory, Metrics
 
 Arrays: TypeAlias = PyTree
 """The arrays of an agent's state; what is static in it is compiled in."""
@@ -27,13 +28,13 @@ class Learner:
     Attributes:
         train: ``(arrays, totals, replay, key, updates) -> (arrays, totals)``: several updates, each
             on a batch of its own; arrays and totals are donated.
-        act: ``(arrays, observation, goal, key) -> actions``, sampled.
+        act: ``(arrays, memory, observation, goal, key) -> (actions, memory)``, sampled.
         act_mean: The same with the tanh of the mean.
     """
 
     train: Callable[..., tuple[Arrays, Metrics]]
-    act: Callable[..., Float[Array, "K action_dim"]]
-    act_mean: Callable[..., Float[Array, "K action_dim"]]
+    act: Callable[..., tuple[Float[Array, "K action_dim"], Memory]]
+    act_mean: Callable[..., tuple[Float[Array, "K action_dim"], Memory]]
 
 
 def split_state(state: eqx.Module) -> tuple[Arrays, Any]:
@@ -59,12 +60,9 @@ def compile_learner(agent: ModuleType, static: Any, config: TrainConfig, spec: E
         return jax.lax.scan(one, (arrays, totals), counts)[0]
 
     def act(
-        arrays: Arrays, observation: Any, goal: Any, key: Key[Array, ""], *, explore: bool
-    ) -> Float[Array, "K action_dim"]:
-        actions: Float[Array, "K action_dim"] = agent.act(
-            eqx.combine(arrays, static), observation, goal, key, explore
-        )
-        return actions
+        arrays: Arrays, *inputs: Any, explore: bool
+    ) -> tuple[Float[Array, "K action_dim"], Memory]:
+        return acting.act(agent, eqx.combine(arrays, static), *inputs, explore=explore)
 
     return Learner(
         train=jax.jit(train, donate_argnums=(0, 1)),

@@ -1,0 +1,5 @@
+"""``python -m midway.cli``."""
+
+from midway.cli.main import main
+
+main()

@@ -1,0 +1,308 @@
+"""The command line: parses, wires, prints."""
+
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from tyro.conf import Positional
+from tyro.constructors import PrimitiveConstructorSpec
+
+from midway.types import ConfigurationError, NonFiniteError
+
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+
+
+def _whole_number(words: list[str]) -> int:
+    """Read 50000, 50_000 or 5e4."""
+    number = float(words[0].replace("_", ""))
+    if not number.is_integer():
+        raise ValueError(f"{words[0]} is not a whole number")
+    return int(number)
+
+
+_NUMBER = PrimitiveConstructorSpec[Any](
+    nargs=1,
+    metavar="N",
+    instance_from_str=_whole_number,
+    is_instance=lambda value: value is None or isinstance(value, int),
+    str_from_instance=lambda value: [str(value)],
+)
+Count = Annotated[int, _NUMBER]
+"""A whole number, which may be written 1e6 or 1_000_000."""
+OptionalCount = Annotated[int | None, _NUMBER]
+"""A whole number, or what the preset or the run says."""
+
+
+def train(
+    env: Positional[str],
+    agent: str = "ris",
+    preset: str = "quick",
+    steps: OptionalCount = None,
+    seed: int = 0,
+    num_envs: OptionalCount = None,
+    out: Path | None = None,
+    precision: Literal["f32", "bf16"] | None = None,
+    set: tuple[str, ...] = (),
+) -> None:
+    """Train an agent on an environment and write a run folder.
+
+    Args:
+        env: Environment name (see `midway envs`).
+        agent: Agent name.
+        preset: paper (table 1) or quick (two cores).
+        steps: Environment steps; default: the preset's.
+        seed: The one seed of every generator.
+        num_envs: Parallel environments; default: the preset's.
+        out: Run folder; default: runs/ENV-AGENT-seedN.
+        precision: Products in float32 or bfloat16; default: the preset's.
+        set: Other settings of the preset, as NAME=VALUE.
+    """
+    from midway.training import api
+
+    changes = {}
+    for change in set:
+        name, equals, value = change.partition("=")
+        if not equals:
+            raise ConfigurationError(f"--set {change!r}: write NAME=VALUE")
+        changes[name.replace("-", "_")] = value
+    run = api.train(
+        env,
+        agent=agent,
+        preset=preset,
+        steps=steps,
+        seed=seed,
+        num_envs=num_envs,
+        out=out,
+        precision=precision,
+        changes=changes,
+        progress=True,
+    )
+    _say_where(run)
+
+
+def resume(run: Positional[Path], steps: OptionalCount = None) -> None:
+    """Continue a run from its newest checkpoint.
+
+    Args:
+        run: Run folder.
+        steps: New total of environment steps; default: the run's own.
+    """
+    from midway.training import api
+
+    _say_where(api.resume(run, steps=steps, progress=True))
+
+
+def evaluate(
+    run: Positional[Path],
+    episodes: Count = 100,
+    task: str = "hard",
+    actions: Literal["mean", "sampled"] = "mean",
+    seed: int = 0,
+    json: bool = False,
+) -> None:
+    """Run episodes of a trained policy and print how many reach their goal.
+
+    Args:
+        run: Run folder.
+        episodes: Number of episodes.
+        task: hard, uniform, or a numbered case of the environment.
+        actions: Mean or sampled actions.
+        seed: Seed of starts and goals.
+        json: Print one JSON object, with every episode.
+    """
+    from midway.training import api
+
+    result = api.evaluate(run, episodes=episodes, task=task, actions=actions, seed=seed)
+    if json:
+        episodes_json = [dataclasses.asdict(episode) for episode in result.episodes]
+        _print_json(
+            {
+                "run": str(run),
+                "task": task,
+                "actions": actions,
+                "seed": seed,
+                "success_rate": result.success_rate,
+                "final_distance": result.final_distance,
+                "episodes": episodes_json,
+            }
+        )
+        return
+    print(
+        f"{run}: {task}, {actions} actions: success {result.success_rate:.1%} of {episodes} "
+        f"episodes, {result.length:.1f} steps, {result.final_distance:.2f} m from the goal"
+    )
+
+
+def report(runs: Positional[tuple[Path, ...]], out: Path | None = None) -> None:
+    """Draw figures and one HTML page from run folders.
+
+    Args:
+        runs: Run folders.
+        out: Folder for the figures; default: figures in the run folder, or report beside the first.
+    """
+    from midway import reports
+
+    for path in reports.report(runs, out):
+        print(path)
+
+
+def watch(
+    run: Positional[Path],
+    out: Path | None = None,
+    task: str = "hard",
+    episodes: Count = 1,
+    seed: int = 0,
+) -> None:
+    """Write a video of the policy with its imagined subgoals.
+
+    Args:
+        run: Run folder.
+        out: The file, .mp4 or .gif; default: videos/TASK.mp4 in the run folder.
+        task: hard, uniform, or a numbered case of the environment.
+        episodes: Number of episodes.
+        seed: Seed of starts and goals.
+    """
+    from midway import reports
+
+    print(reports.watch(run, out, task=task, episodes=episodes, seed=seed))
+
+
+def envs(json: bool = False) -> None:
+    """List the environments and their tasks.
+
+    Args:
+        json: Print one JSON object.
+    """
+    from midway.envs.registry import ENVIRONMENTS
+
+    if json:
+        entries = {
+            name: {"id": e.gym_id, "tasks": list(e.tasks), "description": e.description}
+            for name, e in ENVIRONMENTS.items()
+        }
+        _print_json(entries)
+        return
+    for name, entry in ENVIRONMENTS.items():
+        print(f"{name:12} {entry.gym_id:26} {entry.description}")
+        print(f"{'':12} tasks: {', '.join(entry.tasks)}")
+
+
+def doctor(json: bool = False) -> None:
+    """Say what this machine has and what is missing.
+
+    Args:
+        json: Print one JSON object.
+    """
+    from midway.cli.doctor import checks
+
+    results = checks()
+    if json:
+        _print_json({check.name: dataclasses.asdict(check) for check in results})
+    else:
+        for check in results:
+            print(f"{'ok     ' if check.ok else 'MISSING'} {check.name:12} {check.detail}")
+    if not all(check.ok for check in results if check.needed):
+        sys.exit(EXIT_FAILED)
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "train": train,
+    "resume": resume,
+    "evaluate": evaluate,
+    "report": report,
+    "watch": watch,
+    "envs": envs,
+    "doctor": doctor,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one command; exit with 0, 1 (failed while running) or 2 (wrong use)."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        command = _parse(arguments)
+        _use_compilation_cache()
+        command()
+    except ConfigurationError as error:
+        _fail(EXIT_USAGE, error)
+    except NonFiniteError as error:
+        _fail(EXIT_FAILED, f"{error}; the last good checkpoint is kept")
+    except BrokenPipeError:
+        sys.stdout = None
+        sys.exit(EXIT_FAILED)
+    except (OSError, MemoryError) as error:
+        _fail(EXIT_FAILED, error)
+
+
+def _parse(arguments: Sequence[str]) -> Callable[[], None]:
+    """Return the command with its arguments; a wrong one becomes one clear line."""
+    errors = io.StringIO()
+    delayed = {name: _delay(command) for name, command in COMMANDS.items()}
+    try:
+        with contextlib.redirect_stderr(errors):
+            command: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(
+                delayed,
+                prog="midway",
+                description="Goal-conditioned reinforcement learning with imagined subgoals.",
+                args=arguments,
+            )
+        return command
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise ConfigurationError(_one_line(errors.getvalue())) from None
+
+
+def _delay(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """Return a function of the same signature that only binds its arguments.
+
+    Parsing and running stay apart, so that only messages of the parser are caught.
+    """
+    import functools
+
+    @functools.wraps(command)
+    def bind(*args: Any, **kwargs: Any) -> Callable[[], None]:
+        return functools.partial(command, *args, **kwargs)
+
+    return bind
+
+
+def _one_line(box: str) -> str:
+    """Return the text of the parser's box without its frame and its hint at --help."""
+    lines = [line.strip("│╭╮╰╯ \n") for line in box.splitlines()]
+    text = " ".join(line for line in lines[1:] if line.strip("─"))
+    text = re.split(r"For full helptext|Argument helptext|Perhaps you meant", text)[0]
+    return f"{' '.join(text.split())} (see midway --help)"
+
+
+def _fail(status: int, error: object) -> None:
+    text = " ".join(str(error).split())
+    print(f"midway: {text}", file=sys.stderr)
+    sys.exit(status)
+
+
+def _use_compilation_cache() -> None:
+    """Keep compiled programs between runs, so that a second start of the same shapes is quick."""
+    from jax import config
+
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    config.update("jax_compilation_cache_dir", str(base / "midway" / "compiled"))
+    config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _print_json(value: Any) -> None:
+    print(json.dumps(value))
+
+
+def _say_where(run: Any) -> None:
+    state = "finished" if run.finished else "stopped; continue with: midway resume"
+    print(f"{state} {run.path}")

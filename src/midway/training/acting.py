@@ -1,0 +1,81 @@
+"""Acting, with agents that remember something of their running episodes and with those that do not.
+
+The memory of an agent that remembers nothing is an empty tree, which costs nothing.
+"""
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
+
+from midway.types import EnvSpec, Memory, Remembering
+
+Act = Callable[[Memory, Any, Any, Key[Array, ""]], tuple[Float[Array, "B action_dim"], Memory]]
+"""``(memory, observation, goal, key) -> (actions, memory)``."""
+
+
+def begin(agent: ModuleType, config: Any, spec: EnvSpec, num_episodes: int) -> Memory:
+    """Return what the agent remembers before the first step of each episode."""
+    return agent.begin(config, spec, num_episodes) if isinstance(agent, Remembering) else ()
+
+
+def act(
+    agent: ModuleType,
+    state: Any,
+    memory: Memory,
+    observation: Any,
+    goal: Any,
+    key: Key[Array, ""],
+    *,
+    explore: bool,
+) -> tuple[Float[Array, "B action_dim"], Memory]:
+    """Return actions ``(B, action_dim)`` and the memory after them."""
+    if isinstance(agent, Remembering):
+        return agent.act_on(state, memory, observation, goal, key, explore)
+    return agent.act(state, observation, goal, key, explore), memory
+
+
+def renew(memory: Memory, fresh: Memory, begun: Bool[Any, " B"]) -> Memory:
+    """Return the memory with its rows of newly begun episodes taken from ``fresh``."""
+
+    def choose(new: Array, old: Array) -> Array:
+        return jnp.where(jnp.reshape(begun, (-1, *[1] * (new.ndim - 1))), new, old)
+
+    return jax.tree.map(choose, fresh, memory)
+
+
+class Actor:
+    """A policy in the middle of its episodes, ``actor(observation, goal) -> actions``.
+
+    Its first call begins an episode in every copy of the environment.
+
+    Args:
+        act: The policy on a memory.
+        begin: Returns the memory of as many new episodes.
+        key: Key of all draws.
+    """
+
+    def __init__(self, act: Act, begin: Callable[[int], Memory], key: Key[Array, ""]) -> None:
+        self._act = act
+        self._begin = begin
+        self._key = key
+        self._calls = 0
+        self._fresh: Memory = None
+        self.memory: Memory = None
+
+    def __call__(self, observation: Any, goal: Any) -> np.ndarray[Any, np.dtype[Any]]:
+        """Return actions ``(B, action_dim)`` for one step of every copy."""
+        if self._calls == 0:
+            self._fresh = self.memory = self._begin(len(observation))
+        key = jax.random.fold_in(self._key, self._calls)
+        self._calls += 1
+        actions, self.memory = self._act(self.memory, observation, goal, key)
+        return np.asarray(actions)
+
+    def restart(self, begun: Bool[Any, " B"]) -> None:
+        """Forget the episodes of these copies, in which new ones have begun."""
+        self.memory = renew(self.memory, self._fresh, begun)
