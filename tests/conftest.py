@@ -1,15 +1,17 @@
 """Settings of every test."""
 
+import os
 from pathlib import Path
 
-import jax
 import pytest
+
+from midway.training.compilation import use_compilation_cache
 
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled_programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Compile each program once for the session, and once for the processes that tests start."""
-    folder = tmp_path_factory.mktemp("compiled")
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    folder = tmp_path_factory.mktemp("cache")
+    os.environ["XDG_CACHE_HOME"] = str(folder)
+    use_compilation_cache()
     return folder

@@ -2,9 +2,9 @@
 
 import contextlib
 import dataclasses
+import functools
 import io
 import json
-import os
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -230,7 +230,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         command = _parse(arguments)
-        _use_compilation_cache()
+        from midway.training.compilation import use_compilation_cache
+
+        use_compilation_cache()
         command()
     except ConfigurationError as error:
         _fail(EXIT_USAGE, error)
@@ -267,7 +269,6 @@ def _delay(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
 
     Parsing and running stay apart, so that only messages of the parser are caught.
     """
-    import functools
 
     @functools.wraps(command)
     def bind(*args: Any, **kwargs: Any) -> Callable[[], None]:
@@ -288,15 +289,6 @@ def _fail(status: int, error: object) -> None:
     text = " ".join(str(error).split())
     print(f"midway: {text}", file=sys.stderr)
     sys.exit(status)
-
-
-def _use_compilation_cache() -> None:
-    """Keep compiled programs between runs, so that a second start of the same shapes is quick."""
-    from jax import config
-
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    config.update("jax_compilation_cache_dir", str(base / "midway" / "compiled"))
-    config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
 def _print_json(value: Any) -> None:

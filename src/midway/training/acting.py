@@ -35,8 +35,10 @@ def act(
 ) -> tuple[Float[Array, "B action_dim"], Memory]:
     """Return actions ``(B, action_dim)`` and the memory after them."""
     if isinstance(agent, Remembering):
-        return agent.act_on(state, memory, observation, goal, key, explore)
-    return agent.act(state, observation, goal, key, explore), memory
+        actions, memory = agent.act_on(state, memory, observation, goal, key, explore)
+    else:
+        actions = agent.act(state, observation, goal, key, explore)
+    return actions, memory
 
 
 def renew(memory: Memory, fresh: Memory, begun: Bool[Any, " B"]) -> Memory:

@@ -27,9 +27,17 @@ class Checkpoints:
         self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
 
     def save(self, step: int, state: Any) -> None:
-        """Write a state, a nested dictionary of arrays."""
-        self._manager.save(step, args=ocp.args.StandardSave(state), force=True)
-        self._manager.wait_until_finished()
+        """Write a state, a nested dictionary of arrays.
+
+        Raises:
+            OSError: It cannot be written; the checkpoints before it are as they were.
+        """
+        try:
+            self._manager.save(step, args=ocp.args.StandardSave(state), force=True)
+            self._manager.wait_until_finished()
+        except (OSError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise OSError(f"checkpoint of step {step} cannot be written: {reason}") from error
 
     def latest(self) -> int | None:
         """Return the step of the newest whole checkpoint."""

@@ -1,0 +1,143 @@
+"""The command line as a user types it, bad input included."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import midway
+from midway.cli.main import main
+
+TINY = ["hidden=(8,)", "batch_size=8", "num_envs=4", "random_steps=16", "replay_capacity=2000"]
+TINY += ["evaluate_every=60", "evaluation_episodes=2", "log_every=20", "checkpoint_every=60"]
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    """Return exit status, standard output and standard error of one command."""
+    status = 0
+    try:
+        main(arguments)
+    except SystemExit as stop:
+        status = int(stop.code or 0)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("cli") / "run"
+    main(["train", "point-u", "--steps", "1.2e2", "--out", str(path), "--set", *TINY])
+    return path
+
+
+def test_train_writes_a_run_folder_and_says_where(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "run"
+    arguments = ["--agent", "sac", "--steps", "60", "--out", str(path), "--set", *TINY]
+    status, out, err = run(capsys, "train", "point-u", *arguments)
+    assert status == 0
+    assert out == f"finished {path}\n"
+    assert "step 60/60" in err
+    names = {file.name for file in path.iterdir()}
+    assert {"config.json", "metrics.csv", "evaluation.csv", "checkpoints", "events"} <= names
+    config = json.loads((path / "config.json").read_text())
+    assert config["train"]["batch_size"] == 8
+    assert config["agent"] == "sac"
+    assert {"jax", "mujoco", "midway"} <= set(config["versions"])
+
+
+def test_resume_takes_more_steps(capsys: pytest.CaptureFixture[str], trained: Path) -> None:
+    status, out, _ = run(capsys, "resume", str(trained), "--steps", "180")
+    assert (status, out) == (0, f"finished {trained}\n")
+
+
+def test_evaluate_prints_one_json_object(capsys: pytest.CaptureFixture[str], trained: Path) -> None:
+    arguments = ["--episodes", "3", "--task", "uniform", "--actions", "sampled", "--json"]
+    status, out, _ = run(capsys, "evaluate", str(trained), *arguments)
+    values = json.loads(out)
+    assert status == 0
+    assert values["success_rate"] == sum(e["success"] for e in values["episodes"]) / 3
+    status, out, _ = run(capsys, "evaluate", str(trained), "--episodes", "3")
+    assert status == 0
+    assert "success" in out
+
+
+def test_envs_and_doctor(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "envs", "--json")
+    assert status == 0
+    assert {"point-u", "ant-omega"} <= set(json.loads(out))
+    status, out, _ = run(capsys, "envs")
+    assert "midway/AntMaze-Pi-v0" in out
+    status, out, _ = run(capsys, "doctor", "--json")
+    checks = json.loads(out)
+    assert status == 0
+    assert checks["simulation"]["ok"]
+    assert checks["device"]["ok"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ([], "train"),
+        (["fly"], "fly"),
+        (["train"], "STR"),
+        (["train", "point-x"], "point-x"),
+        (["train", "point-u", "--agent", "dqn"], "dqn"),
+        (["train", "point-u", "--preset", "slow"], "slow"),
+        (["train", "point-u", "--stepz", "5"], "--stepz"),
+        (["train", "point-u", "--steps", "1.5"], "1.5"),
+        (["train", "point-u", "--steps", "-5"], "-5"),
+        (["train", "point-u", "--precision", "f16"], "f16"),
+        (["train", "point-u", "--set", "batch"], "batch"),
+        (["train", "point-u", "--set", "batches=3"], "batches"),
+        (["train", "point-u", "--set", "batch_size=many"], "many"),
+        (["train", "point-u", "--set", "relabel=(0.5,0.4,0.4)"], "0.5"),
+        (["train", "point-u", "--set", "replay_capacity=100"], "100"),
+        (["train", "point-u", "--set", "random_steps=1"], "random_steps"),
+        (["train", "point-u", "--out", "/proc/nowhere/run"], "/proc/nowhere/run"),
+        (["resume", "/no/such/folder"], "/no/such/folder"),
+        (["evaluate", "/no/such/folder"], "/no/such/folder"),
+        (["evaluate", "RUN", "--task", "easy"], "easy"),
+        (["evaluate", "RUN", "--episodes", "0"], "0"),
+    ],
+)
+def test_wrong_use_is_one_clear_line_and_status_2(
+    capsys: pytest.CaptureFixture[str], trained: Path, arguments: list[str], named: str
+) -> None:
+    arguments = [str(trained) if argument == "RUN" else argument for argument in arguments]
+    status, out, err = run(capsys, *arguments)
+    assert status == 2
+    assert out == ""
+    assert err.startswith("midway: ")
+    assert err.count("\n") == 1
+    assert named in err
+
+
+def test_full_disk_fails_in_one_line_and_keeps_the_last_checkpoint(
+    trained: Path, tmp_path: Path
+) -> None:
+    """A limit on the size of files stands for a full disk: both make a write fail."""
+    path = tmp_path / "run"
+    main(["train", "point-u", "--steps", "60", "--out", str(path), "--set", *TINY])
+    before = {file.name for file in (path / "checkpoints").iterdir()}
+
+    resume = f"{sys.executable} -m midway.cli resume {path} --steps 240"
+    result = subprocess.run(
+        ["bash", "-c", f"export XDG_CACHE_HOME={tmp_path}; ulimit -f 4; exec {resume}"],
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 1
+    assert result.stderr.splitlines()[-1].startswith("midway: ")
+    assert before <= {file.name for file in (path / "checkpoints").iterdir()}
+    assert midway.resume(path, steps=120).finished
+
+
+def test_module_runs_as_a_program(trained: Path) -> None:
+    command = [sys.executable, "-m", "midway.cli", "evaluate", str(trained), "--episodes", "2"]
+    result = subprocess.run([*command, "--json"], capture_output=True, text=True)
+    assert result.returncode == 0
+    assert len(json.loads(result.stdout)["episodes"]) == 2
