@@ -1,0 +1,237 @@
+"""What every agent promises: pure updates, one compilation, targets that move by τ, actions."""
+
+import functools
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from midway.agents import registry, ris, sac
+from midway.types import ConfigurationError
+
+KEY = jax.random.key(7)
+
+
+def arrays(tree) -> list[np.ndarray]:
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array))]
+
+
+def equal(first, second) -> bool:
+    pairs = zip(arrays(first), arrays(second), strict=True)
+    return all(np.array_equal(a, b) for a, b in pairs)
+
+
+def changed(before, after) -> set[str]:
+    """Return the fields of the state whose arrays differ."""
+    fields = set(vars(before)) - {"config", "spec"}
+    return {name for name in fields if not equal(getattr(before, name), getattr(after, name))}
+
+
+def test_registry_knows_the_agents():
+    assert registry.get("ris") is ris
+    assert registry.get("sac") is sac
+    for module in registry.AGENTS.values():
+        assert {"Config", "State", "NETWORKS", "create", "update", "act"} <= set(dir(module))
+
+
+def test_registry_refuses_unknown_names_and_says_what_is_allowed():
+    with pytest.raises(ConfigurationError, match=r"unknown agent 'dqn'.*ris, sac") as error:
+        registry.get("dqn")
+    assert "\n" not in str(error.value)
+
+
+def test_defaults_are_table_1_for_ant_navigation():
+    assert vars(ris.Config()) == {
+        "hidden": (256, 256),
+        "discount": 0.99,
+        "target_update_rate": 5e-3,
+        "critic_learning_rate": 1e-3,
+        "policy_learning_rate": 1e-3,
+        "subgoal_learning_rate": 1e-4,
+        "encoder_learning_rate": 1e-4,
+        "kl_weight": 0.1,
+        "advantage_temperature": 0.1,
+        "num_subgoals": 10,
+        "epsilon": 1e-16,
+        "precision": "f32",
+    }
+    assert ris.Config().value_bound == pytest.approx(100)
+    shared = vars(sac.Config()).items() & vars(ris.Config()).items()
+    assert len(shared) == len(vars(sac.Config())) - 1  # all but the entropy's learning rate
+
+
+def test_copies_start_equal_to_their_originals_with_arrays_of_their_own(case):
+    state = case.state
+    copies = [(state.critic, state.target_critic)]
+    if case.agent is ris:
+        copies.append((state.policy, state.prior_policy))
+    for online, copy in copies:
+        assert equal(online, copy)
+        pointers = [
+            {leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(tree)}
+            for tree in (online, copy)
+        ]
+        assert not pointers[0] & pointers[1]
+
+
+def test_networks_are_parts_of_the_state(case):
+    assert set(case.agent.NETWORKS) <= set(vars(case.state))
+    assert "policy" in case.agent.NETWORKS
+
+
+def test_update_changes_every_part_and_reports_finite_scalars(case):
+    state, metrics = case.update(case.state, case.batch, KEY)
+    stateless = {"encoder", "encoder_optimizer"}  # the encoder of states has no weights
+    assert changed(case.state, state) >= set(vars(state)) - {"config", "spec"} - stateless
+    assert all(np.isfinite(x).all() for x in arrays(state))
+    groups = {"critic", "policy"} | ({"subgoal"} if case.agent is ris else set())
+    assert {name.split("/")[0] for name in metrics} == groups
+    for name, value in metrics.items():
+        assert value.shape == (), name
+        assert value.dtype == jnp.float32, name
+        assert np.isfinite(value), name
+
+
+def test_update_is_pure(case):
+    before = [x.copy() for x in arrays((case.state, case.batch))]
+    first = case.update(case.state, case.batch, KEY)
+    second = case.update(case.state, case.batch, KEY)
+    assert equal(first, second)
+    after = arrays((case.state, case.batch))
+    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def test_update_depends_on_its_key(case):
+    first, _ = case.update(case.state, case.batch, KEY)
+    second, _ = case.update(case.state, case.batch, jax.random.key(8))
+    assert {"critic", "policy"} <= changed(first, second)
+
+
+def test_targets_move_by_exactly_the_target_update_rate(case):
+    """A new target is τ times the new network plus 1 - τ times the old target."""
+    state, _ = case.update(case.state, case.batch, KEY)
+    again, _ = case.update(state, case.batch, jax.random.key(8))
+    rate = case.state.config.target_update_rate
+    pairs = [("critic", "target_critic")]
+    if case.agent is ris:
+        pairs.append(("policy", "prior_policy"))
+    for online, copy in pairs:
+        for new, old_copy, new_copy in zip(
+            *(arrays(x) for x in (getattr(again, online), getattr(state, copy))),
+            arrays(getattr(again, copy)),
+            strict=True,
+        ):
+            expected = rate * new.astype(np.float64) + (1 - rate) * old_copy
+            np.testing.assert_allclose(new_copy, expected, rtol=1e-5, atol=1e-8)
+            assert not np.array_equal(new_copy, old_copy)
+
+
+def test_many_updates_compile_once(case):
+    traces = 0
+
+    @eqx.filter_jit
+    def update(state, batch, key):
+        nonlocal traces
+        traces += 1
+        return case.agent.update(state, batch, key)
+
+    state = case.state
+    for i in range(5):
+        state, _ = update(state, case.batch, jax.random.key(i))
+    assert traces == 1
+
+
+def test_critic_learns_a_fixed_batch(case):
+    """Where every step reaches its goal, every Q is -1."""
+    batch = case.batch._replace(terminated=jnp.ones_like(case.batch.terminated))
+    state, first = case.update(case.state, batch, KEY)
+    for i in range(60):
+        state, last = case.update(state, batch, jax.random.key(i))
+    assert last["critic/loss"] < 0.05 * first["critic/loss"]
+    assert last["critic/target"] == -1
+    assert last["critic/q"] == pytest.approx(-1, abs=0.1)
+
+
+def act(case, key=KEY, explore=False):
+    return acting(case)(case.state, case.batch.observation, case.batch.goal, key, explore)
+
+
+@functools.cache
+def compiled(function):
+    return eqx.filter_jit(function)
+
+
+def acting(case):
+    return compiled(case.agent.act)
+
+
+def test_actions_are_the_tanh_of_the_mean_without_exploration(case):
+    actions = act(case)
+    assert actions.shape == case.batch.action.shape
+    mean = case.state.policy(case.batch.observation, case.batch.goal).mean
+    np.testing.assert_allclose(actions, np.tanh(mean), rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(actions, act(case, key=jax.random.key(8)))
+
+
+def test_actions_are_sampled_with_exploration(case):
+    """Undoing tanh, mean and std from many draws leaves standard normal noise."""
+    draw = acting(case)
+    batch = case.batch
+    draws = [
+        np.asarray(draw(case.state, batch.observation, batch.goal, jax.random.key(i), True))
+        for i in range(60)
+    ]
+    assert np.abs(draws).max() <= 1
+    assert len(np.unique(draws)) == np.size(draws)
+    actions = case.state.policy(batch.observation, batch.goal)
+    noise = (np.arctanh(np.asarray(draws, np.float64)) - actions.mean) / np.exp(actions.log_std)
+    assert noise.mean() == pytest.approx(0, abs=0.06)
+    assert noise.std() == pytest.approx(1, abs=0.06)
+    again = draw(case.state, batch.observation, batch.goal, jax.random.key(0), True)
+    np.testing.assert_array_equal(again, draws[0])
+
+
+@pytest.mark.parametrize("explore", [False, True])
+def test_actions_stay_in_their_bounds_whatever_the_policy_says(case, explore):
+    last = case.state.policy.network.layers[-1]
+    state = eqx.tree_at(
+        lambda s: s.policy.network.layers[-1].bias, case.state, 100 * jnp.ones_like(last.bias)
+    )
+    actions = acting(case)(state, case.batch.observation, case.batch.goal, KEY, explore)
+    assert abs(actions).max() <= 1
+    assert abs(actions).max() > 0.99
+
+
+def test_actions_come_from_the_policy_alone(case):
+    """At test time the flat policy acts: no critic, no copy and no subgoal policy has a say."""
+    broken = {
+        name: jax.tree.map(lambda x: jnp.nan * x, getattr(case.state, name))
+        for name in case.agent.NETWORKS
+        if name not in {"encoder", "policy"}
+    }
+    actions = acting(case)(
+        replace(case.state, **broken), case.batch.observation, case.batch.goal, KEY, False
+    )
+    np.testing.assert_array_equal(actions, act(case))
+
+
+def test_half_precision_products_leave_everything_else_in_float32(case):
+    config = replace(case.state.config, precision="bf16")
+    state = case.agent.create(config, case.spec, jax.random.key(0))
+    assert equal(state, case.state)  # the same start
+    result = eqx.filter_eval_shape(case.agent.update, state, case.batch, KEY)
+    types = {leaf.dtype for leaf in jax.tree.leaves(eqx.filter(result, is_array_or_shape))}
+    assert types <= {jnp.dtype(jnp.float32), jnp.dtype(jnp.int32)}
+
+
+def is_array_or_shape(leaf) -> bool:
+    return hasattr(leaf, "dtype")
+
+
+def test_update_refuses_wrong_shapes(case):
+    batch = case.batch._replace(goal=case.batch.goal[:-1])
+    with pytest.raises(TypeError):
+        eqx.filter_eval_shape(case.agent.update, case.state, batch, KEY)
