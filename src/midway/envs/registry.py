@@ -4,7 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+import gymnasium
+
 from midway.envs.ant_maze import AntMazeVectorEnv
+from midway.envs.foreign import ForeignVectorEnv
 from midway.envs.ids import GYM_IDS
 from midway.envs.mazes import MAZES
 from midway.envs.point_maze import PointMazeVectorEnv
@@ -57,16 +60,20 @@ ENVIRONMENTS: dict[str, Entry] = {
 
 
 def entry(name: str) -> Entry:
-    """Return the entry of an environment.
+    """Return the entry of an environment; other Gymnasium goal environments go by their own id.
 
     Raises:
         ConfigurationError: There is none of this name.
     """
-    if name not in ENVIRONMENTS:
-        raise ConfigurationError(
-            f"unknown environment {name!r}: use one of {', '.join(ENVIRONMENTS)}"
-        )
-    return ENVIRONMENTS[name]
+    if name in ENVIRONMENTS:
+        return ENVIRONMENTS[name]
+    if name in gymnasium.registry:
+        factory = partial(ForeignVectorEnv, name)
+        return Entry(name, name, "registered with Gymnasium", ("uniform",), factory)
+    raise ConfigurationError(
+        f"unknown environment {name!r}: use one of {', '.join(ENVIRONMENTS)}, or the Gymnasium id "
+        "of a goal environment"
+    )
 
 
 def make_vec(

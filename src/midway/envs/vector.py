@@ -42,6 +42,8 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
     """
 
     metadata = {"autoreset_mode": AutoresetMode.DISABLED, "render_modes": []}  # noqa: RUF012
+    resumable = True
+    """Whether ``load_state_dict`` continues in the middle of the episodes."""
     option_names: tuple[str, ...] = ("reset_mask", "task")
     """What ``options`` of ``reset`` may hold."""
     single_observation_space: spaces.Dict

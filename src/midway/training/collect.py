@@ -79,8 +79,12 @@ class Collector:
         }
 
     @staticmethod
-    def restore(env: Any, state: dict[str, Any]) -> "Collector":
+    def restore(
+        env: Any, replay: ReplayState, state: dict[str, Any]
+    ) -> tuple["Collector", ReplayState]:
         """Return the collector that ``state_dict`` was taken from, on a new environment.
+
+        Where the environment cannot continue its episodes, new ones begin in every copy.
 
         Raises:
             ConfigurationError: The state is not one of this environment.
@@ -92,5 +96,10 @@ class Collector:
                 f"the checkpoint does not fit the environment: {error}"
             ) from error
         counts = EpisodeCounts(**{name: int(value) for name, value in state["counts"].items()})
-        nobody = np.zeros(env.num_envs, np.bool_)
-        return Collector(env, dict(state["observation"]), nobody, counts)
+        everyone = np.ones(env.num_envs, np.bool_)
+        if env.resumable:
+            return Collector(env, dict(state["observation"]), ~everyone, counts), replay
+        observation, _ = env.reset()
+        return Collector(env, observation, everyone, counts), step.begin(
+            replay, observation, everyone
+        )

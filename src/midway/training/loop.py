@@ -128,7 +128,7 @@ class Training:
 
     def evaluate(self) -> Iterator[Evaluation]:
         """Yield the evaluations of the current policy, on environments of their own."""
-        for task in EVALUATED_TASKS:
+        for task in [task for task in EVALUATED_TASKS if task in self.collector.env.tasks]:
             if task not in self._evaluation_envs:
                 episodes = self.config.train.evaluation_episodes
                 self._evaluation_envs[task] = self._make_env(episodes, task)
@@ -172,8 +172,11 @@ class Training:
         self.arrays = with_named_arrays(self.arrays, state["agent"])
         self.memory = with_named_arrays(self.memory, state.get("memory", {}))
         self.totals = state["totals"]
-        self.replay = with_named_arrays(self.replay, state["replay"])
-        self.collector = Collector.restore(self.collector.env, state["collector"])
+        replay = with_named_arrays(self.replay, state["replay"])
+        self.collector, self.replay = Collector.restore(
+            self.collector.env, replay, state["collector"]
+        )
+        self.memory = acting.renew(self.memory, self._fresh, self.collector.begun)
         counters = state["counters"]
         self.steps = int(counters["steps"])
         self.updates = int(counters["updates"])
