@@ -78,6 +78,14 @@ def test_envs_and_doctor(capsys: pytest.CaptureFixture[str]) -> None:
     assert checks["device"]["ok"]
 
 
+def test_bench_prints_figures_with_the_machine(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "bench", "env", "--env", "point-u", "--num-envs", "2", "--json")
+    values = json.loads(out)
+    assert status == 0
+    assert values["env"]["steps_per_s"] > 0
+    assert values["machine"]["cores"] >= 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

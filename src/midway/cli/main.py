@@ -176,6 +176,45 @@ def watch(
     print(reports.watch(run, out, task=task, episodes=episodes, seed=seed))
 
 
+def bench(
+    what: Positional[Literal["all", "update", "env", "replay", "loop"]] = "all",
+    env: str = "ant-u",
+    agent: str = "ris",
+    batch: Count = 256,
+    precision: Literal["f32", "bf16"] = "f32",
+    num_envs: Count = 64,
+    json: bool = False,
+) -> None:
+    """Measure how fast this machine updates, simulates and stores.
+
+    Args:
+        what: One piece, or all of them.
+        env: Environment name.
+        agent: Agent name.
+        batch: Transitions of one update.
+        precision: Products in float32 or bfloat16.
+        num_envs: Copies of the environment that are stepped together in env.
+        json: Print one JSON object.
+    """
+    from midway.training import bench as measure
+
+    pieces: dict[str, Callable[[], dict[str, Any]]] = {
+        "update": lambda: measure.update(env, agent, batch, precision),
+        "env": lambda: measure.environment(env, num_envs),
+        "replay": lambda: measure.replay(env, batch, 1_000_000),
+        "loop": lambda: measure.whole_loop(env, agent, batch, precision),
+    }
+    chosen = pieces if what == "all" else {what: pieces[what]}
+    of = {"env": env, "agent": agent, "batch": batch, "precision": precision, "num_envs": num_envs}
+    results = {name: piece() for name, piece in chosen.items()}
+    if json:
+        _print_json({"machine": measure.machine(), "settings": of, **results})
+        return
+    print(", ".join(f"{name} {value}" for name, value in {**measure.machine(), **of}.items()))
+    for name, figures in results.items():
+        print(f"{name:8}" + "  ".join(f"{key} {value:.4g}" for key, value in figures.items()))
+
+
 def envs(json: bool = False) -> None:
     """List the environments and their tasks.
 
@@ -220,6 +259,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "evaluate": evaluate,
     "report": report,
     "watch": watch,
+    "bench": bench,
     "envs": envs,
     "doctor": doctor,
 }

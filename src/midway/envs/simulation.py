@@ -65,7 +65,7 @@ class SimulationVectorEnv(GoalVectorEnv):
         if num_threads == 0:
             num_threads = min(num_cores(), -(-num_envs // self.copies_per_thread))
         self.batch = Batch(model, num_envs, min(num_threads, num_envs))
-        self._substeps = substeps
+        self.substeps = substeps
         # These are live views of the simulations' state.
         self._qpos = self.batch.bind("qpos")
         self._qvel = self.batch.bind("qvel")
@@ -94,7 +94,7 @@ class SimulationVectorEnv(GoalVectorEnv):
 
     def _advance(self, actions: Shaped[Array, "num_envs action_dim"]) -> None:
         self._apply(actions)
-        self.batch.step(nstep=self._substeps)
+        self.batch.step(nstep=self.substeps)
 
     def _observe(self) -> Observations:
         return self._achieved() | {name: goal.copy() for name, goal in self._goals.items()}

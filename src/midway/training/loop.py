@@ -20,6 +20,7 @@ import numpy as np
 from midway.replay import buffer
 from midway.training import acting
 from midway.training import policy as policies
+from midway.training import pretrain
 from midway.training import step as steps_of
 from midway.training.arrays import named_arrays, with_named_arrays
 from midway.training.checkpoint import Checkpoints
@@ -50,6 +51,7 @@ class Training:
     def __init__(
         self, agent: ModuleType, config: RunConfig, make_env: MakeEnv, folder: RunFolder
     ) -> None:
+        self.agent = agent
         self.config = config
         self.folder = folder
         train = config.train
@@ -68,7 +70,7 @@ class Training:
         self._fresh = self.memory = self._begin(train.num_envs)
         replay = buffer.create(self.spec, train.replay_capacity, train.num_envs)
         self.totals = steps_of.empty_totals(agent, self.arrays, self._static, train, replay)
-        self._learner = steps_of.compile_learner(agent, self._static, train, self.spec)
+        self.learner = steps_of.compile_learner(agent, self._static, train, self.spec)
         self.collector, self.replay = Collector.start(env, replay, self._env_seed)
         self._evaluation_envs: dict[str, Any] = {}
         self.steps = 0
@@ -76,6 +78,19 @@ class Training:
         self.updates_logged = 0
         self.training_seconds = 0.0
         self.seconds = 0.0
+
+    @property
+    def state(self) -> Any:
+        """The agent's state."""
+        return eqx.combine(self.arrays, self._static)
+
+    def pretrain(self, say: Reporter) -> None:
+        """Let the agent learn from states before the first step, if it is one that does."""
+        state, seconds = pretrain.run(
+            self.agent, self.state, self._make_env, self.config.seed, self.folder, say
+        )
+        self.arrays, _ = steps_of.split_state(state)
+        self.seconds += seconds
 
     # --- one turn of the loop ---------------------------------------------------------------------
 
@@ -88,7 +103,7 @@ class Training:
         self.steps += self.config.train.num_envs
         per_call = self.config.train.updates_per_call
         while self.config.train.updates_due(self.steps) - self.updates >= per_call:
-            self.arrays, self.totals = self._learner.train(
+            self.arrays, self.totals = self.learner.train(
                 self.arrays, self.totals, self.replay, self._update_key, self.updates
             )
             self.updates += per_call
@@ -102,7 +117,7 @@ class Training:
             return generator.uniform(-1, 1, shape).astype(np.float32)
         key = jax.random.fold_in(self._act_key, self.steps)
         pair = observation["observation"], observation["desired_goal"]
-        actions, self.memory = self._learner.act(self.arrays, self.memory, *pair, key)
+        actions, self.memory = self.learner.act(self.arrays, self.memory, *pair, key)
         return np.asarray(actions)
 
     # --- what is looked at from time to time ------------------------------------------------------
@@ -143,7 +158,7 @@ class Training:
 
     def policy(self, actions: ActionKind) -> Callable[[Any, Any], Any]:
         """Return the current policy, for a batch of observations and goals."""
-        act = self._learner.act_mean if actions == "mean" else self._learner.act
+        act = self.learner.act_mean if actions == "mean" else self.learner.act
         return acting.Actor(partial(act, self.arrays), self._begin, self._evaluation_key)
 
     # --- files ------------------------------------------------------------------------------------
@@ -194,7 +209,7 @@ class Training:
             if not bool(np.isfinite(np.asarray(array)).all()):
                 raise NonFiniteError(f"{name} is not finite at step {self.steps}")
         checkpoints.save(self.steps, self.state_dict())
-        policies.save(self.folder, self.config, eqx.combine(self.arrays, self._static))
+        policies.save(self.folder, self.config, self.state)
 
 
 def run(training: Training, checkpoints: Checkpoints, logger: Logger, reporter: Reporter) -> bool:
@@ -206,6 +221,8 @@ def run(training: Training, checkpoints: Checkpoints, logger: Logger, reporter: 
         NonFiniteError: A loss or a network is not finite; the last good checkpoint is kept.
     """
     train = training.config.train
+    if training.steps == 0:
+        training.pretrain(reporter)
     started = time.perf_counter() - training.seconds
     success: dict[str, float] = {}
     with _interruptible() as interrupted:

@@ -1,0 +1,253 @@
+"""How fast the pieces run on this machine: update, environment, replay, and the loop of them.
+
+Times are medians over repetitions after a warm-up; where two things are compared, their repetitions
+alternate, so that a machine that drifts slows both.
+"""
+
+import importlib.metadata
+import os
+import platform
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from midway.envs import registry as environments
+from midway.replay import buffer
+from midway.training import api, loop, step
+from midway.training.folder import RunFolder
+
+Figures = dict[str, Any]
+
+REPETITIONS = 30
+ROWS = 20_000
+"""Rows in the replay that updates draw from: more than the processor's caches hold."""
+
+
+def machine() -> Figures:
+    """Return what the figures depend on."""
+    packages = ("midway", "jax", "jaxlib", "mujoco", "numpy")
+    return {
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "device": jax.devices()[0].device_kind,
+        "versions": {name: importlib.metadata.version(name) for name in packages},
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def medians(pieces: dict[str, Callable[[], Any]], repetitions: int = REPETITIONS) -> Figures:
+    """Return the median time of each piece in milliseconds; the pieces alternate."""
+    times: dict[str, list[float]] = {name: [] for name in pieces}
+    for piece in pieces.values():
+        jax.block_until_ready(piece())
+    for _ in range(repetitions):
+        for name, piece in pieces.items():
+            started = time.perf_counter()
+            jax.block_until_ready(piece())
+            times[name].append(time.perf_counter() - started)
+    return {name: 1e3 * statistics.median(values) for name, values in times.items()}
+
+
+def update(env: str, agent: str, batch: int, precision: str) -> Figures:
+    """Time one update, with sampling and relabelling, and compare it with its products alone.
+
+    The limit is the time that the products would take at the rate of a product of 2048 x 256 by
+    256 x 256 in the same precision, measured in turn with the update.
+
+    Args:
+        env: Environment, for the sizes.
+        agent: Agent.
+        batch: Transitions of one update.
+        precision: ``f32`` or ``bf16``.
+    """
+    training = _training(env, agent, batch, precision, updates_per_call=1)
+    _fill(training)
+    learner, train = training.learner, training.config.train
+    arguments = (training.replay, jax.random.key(0), 0)
+    flops = _product_flops(learner.train, (training.arrays, training.totals, *arguments))
+
+    def one_update() -> Any:
+        training.arrays, training.totals = learner.train(
+            training.arrays, training.totals, *arguments
+        )
+        return training.totals
+
+    sample = jax.jit(
+        lambda replay, key: buffer.sample(replay, training.spec, train.relabel, batch, key)
+    )
+    times = medians(
+        {
+            "update_ms": one_update,
+            "sample_ms": lambda: sample(training.replay, jax.random.key(1)),
+            "product": _reference_product(precision),
+        }
+    )
+    rate = 2 * 2048 * 256 * 256 / (times.pop("product") / 1e3)
+    limit = 1e3 * flops / rate
+    return {
+        **times,
+        "gflop": flops / 1e9,
+        "product_gflop_per_s": rate / 1e9,
+        "limit_ms": limit,
+        "share_of_limit": limit / times["update_ms"],
+    }
+
+
+def environment(env: str, num_envs: int) -> Figures:
+    """Compare steps of the vector environment with steps of its bare simulations on all cores.
+
+    Args:
+        env: Environment.
+        num_envs: Copies.
+    """
+    vector: Any = environments.make_vec(env, num_envs=num_envs)
+    vector.reset(seed=0)
+    generator = np.random.default_rng(0)
+    actions = generator.uniform(-1, 1, (num_envs, vector.goal_spec.action_dim)).astype("float32")
+    counts = 20
+
+    def steps() -> None:
+        for _ in range(counts):
+            _, _, terminated, truncated, _ = vector.step(actions)
+            if (terminated | truncated).any():
+                vector.reset(options={"reset_mask": terminated | truncated})
+
+    pieces: dict[str, Callable[[], Any]] = {"environment": steps}
+    if hasattr(vector, "batch"):
+        substeps = vector.substeps
+
+        def bare() -> None:
+            for _ in range(counts):
+                vector.batch.step(nstep=substeps)
+
+        pieces["bare"] = bare
+    times = medians(pieces)
+    per_second = {n: 1e3 * counts * num_envs / milliseconds for n, milliseconds in times.items()}
+    figures = {"steps_per_s": per_second["environment"]}
+    if "bare" in per_second:
+        figures["bare_steps_per_s"] = per_second["bare"]
+        figures["share_of_bare"] = per_second["environment"] / per_second["bare"]
+    return figures
+
+
+def replay(env: str, batch: int, capacity: int) -> Figures:
+    """Time writing one step of 8 environments and drawing a batch, and say what the ring takes.
+
+    Args:
+        env: Environment, for the sizes.
+        batch: Transitions of one draw.
+        capacity: Rows of the ring.
+    """
+    training = _training(env, "sac", batch, "f32", 1, replay_capacity=capacity)
+    _fill(training)
+    observation = training.collector.observation
+    actions = np.zeros((training.config.train.num_envs, training.spec.action_dim), np.float32)
+    everyone = np.ones(len(actions), np.bool_)
+    mix = training.config.train.relabel
+    sample = jax.jit(lambda ring, key: buffer.sample(ring, training.spec, mix, batch, key))
+
+    def add() -> Any:
+        training.replay = step.add(training.replay, actions, observation, everyone)
+        return training.replay.num_rows
+
+    times = medians(
+        {"add_ms": add, "sample_ms": lambda: sample(training.replay, jax.random.key(0))}
+    )
+    size = buffer.memory_bytes(training.spec, capacity, training.config.train.num_envs)
+    return {**times, "gib": size / 2**30}
+
+
+def whole_loop(env: str, agent: str, batch: int, precision: str) -> Figures:
+    """Return the share of the loop's time that is spent inside updates, at one update per step.
+
+    Args:
+        env: Environment.
+        agent: Agent.
+        batch: Transitions of one update.
+        precision: ``f32`` or ``bf16``.
+    """
+    training = _training(env, agent, batch, precision, updates_per_call=8)
+    _fill(training)
+    learner = training.learner
+
+    def turn() -> Any:
+        training.advance()
+        return training.totals
+
+    def updates() -> Any:
+        training.arrays, training.totals = learner.train(
+            training.arrays, training.totals, training.replay, jax.random.key(0), 0
+        )
+        return training.totals
+
+    times = medians({"turn": turn, "updates": updates})
+    num_envs = training.config.train.num_envs
+    return {
+        "steps_per_s": 1e3 * num_envs / times["turn"],
+        "share_in_updates": times["updates"] / times["turn"],
+    }
+
+
+def _training(
+    env: str, agent: str, batch: int, precision: str, updates_per_call: int, **changes: Any
+) -> loop.Training:
+    """Return a run of 8 environments that writes nothing."""
+    settings = {
+        "num_envs": 8,
+        "batch_size": batch,
+        "precision": precision,
+        "updates_per_step": updates_per_call / 8,
+        "random_steps": ROWS,
+        "replay_capacity": 2 * ROWS,
+        **changes,
+    }
+    config = api.configure(env, agent, "quick", 0, settings)
+    return api.build(config, RunFolder(Path(tempfile.gettempdir()) / "midway-bench"))
+
+
+def _fill(training: loop.Training) -> None:
+    """Collect random steps until updates begin."""
+    while training.steps < training.config.train.random_steps:
+        training.advance()
+
+
+def _product_flops(function: Any, arguments: tuple[Any, ...]) -> float:
+    """Return the floating-point operations of all matrix products in a compiled function."""
+    return sum(_products(jax.make_jaxpr(function)(*arguments).jaxpr))
+
+
+def _products(jaxpr: Any) -> list[float]:
+    """Return 2 x outputs x contracted length of each product, also of inner functions."""
+    found = []
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            (contracted, _), _ = equation.params["dimension_numbers"]
+            lengths = [equation.invars[0].aval.shape[axis] for axis in contracted]
+            found.append(2.0 * equation.outvars[0].aval.size * float(np.prod(lengths)))
+        for inner in jax.core.jaxprs_in_params(equation.params):
+            found += _products(inner)
+    return found
+
+
+def _reference_product(precision: str) -> Callable[[], Any]:
+    """Return ten products of 2048 x 256 by 256 x 256 in one call, as a function of no arguments."""
+    dtype = jnp.bfloat16 if precision == "bf16" else jnp.float32
+    x = jnp.ones((2048, 256), dtype)
+    weight = jnp.ones((256, 256), dtype)
+    product = jax.jit(lambda a, b: jnp.matmul(a, b, preferred_element_type=jnp.float32))
+    return lambda: product(x, weight)
