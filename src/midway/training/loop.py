@@ -18,9 +18,8 @@ import jax
 import numpy as np
 
 from midway.replay import buffer
-from midway.training import acting
+from midway.training import acting, pretrain
 from midway.training import policy as policies
-from midway.training import pretrain
 from midway.training import step as steps_of
 from midway.training.arrays import named_arrays, with_named_arrays
 from midway.training.checkpoint import Checkpoints
