@@ -9,11 +9,13 @@ RUN ?= runs/point-u
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	touch $@
 
+# Typed again, it continues where it was stopped.
 train: $(VENV)/installed
-	$(BIN)/midway train point-u --out $(RUN)
+	if [ -e $(RUN)/config.json ]; then $(BIN)/midway resume $(RUN); \
+	else $(BIN)/midway train point-u --out $(RUN); fi
 	$(BIN)/midway evaluate $(RUN)
 	$(BIN)/midway report $(RUN)
 
