@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from replay_reference import SIZES, SPECS, VECTOR, Reference, add, begin, contents, names, sample
 
@@ -90,6 +90,7 @@ def test_batch_is_what_was_written(name, size, script, seed):
 @pytest.mark.parametrize("size", SIZES)
 @settings(max_examples=15, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(lengths=st.lists(st.integers(0, 4), min_size=10, max_size=40))
+@example(lengths=[1] * 39 + [0])  # as many episodes as a lane can hold
 def test_wraps_with_whole_episodes(size, lengths):
     # Full-length use: every lane runs episodes one after the other, the ring wraps several times.
     script = [op for length in lengths for op in [(True, 7)] + [(False, 7)] * length]
