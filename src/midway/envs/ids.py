@@ -6,7 +6,7 @@ GYM_IDS = {
     f"{body}-{shape.lower()}": f"midway/{title}-{shape}-v0"
     for body, title in (("point", "PointMaze"), ("ant", "AntMaze"))
     for shape in ("U", "S", "Pi", "Omega")
-}
+} | {"push": "midway/Push-v0", "push-state": "midway/PushState-v0"}
 """Gymnasium id of each environment by the name that users type."""
 
 

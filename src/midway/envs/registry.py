@@ -11,6 +11,8 @@ from midway.envs.foreign import ForeignVectorEnv
 from midway.envs.ids import GYM_IDS
 from midway.envs.mazes import MAZES
 from midway.envs.point_maze import PointMazeVectorEnv
+from midway.envs.push import PushStateVectorEnv, PushVectorEnv
+from midway.envs.push_scene import TASKS
 from midway.envs.vector import GoalVectorEnv
 from midway.types import ConfigurationError
 
@@ -49,11 +51,17 @@ def _maze_entries(
     ]
 
 
+def _push_entry(name: str, description: str, factory: Callable[..., GoalVectorEnv]) -> Entry:
+    return Entry(name, GYM_IDS[name], description, tuple(TASKS), factory)
+
+
 ENVIRONMENTS: dict[str, Entry] = {
     entry.name: entry
     for entry in [
         *_maze_entries("point", "point mass", PointMazeVectorEnv),
         *_maze_entries("ant", "four-legged ant", AntMazeVectorEnv),
+        _push_entry("push", "arm that pushes a puck, seen in images", PushVectorEnv),
+        _push_entry("push-state", "the same arm, with states for images", PushStateVectorEnv),
     ]
 }
 """Every environment by name, in the order of lists."""
