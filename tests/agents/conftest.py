@@ -1,6 +1,7 @@
 """Agents on small problems: states of 4 as goals, or goals of 2 beside observations of 6."""
 
 import functools
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -39,6 +40,7 @@ def draw_batch(spec: EnvSpec, size: int, seed: int = 0) -> Batch:
 
     observation, goal = normal(size, *spec.observation_shape), normal(size, *spec.goal_shape)
     next_observation = observation + 0.3 * normal(size, *spec.observation_shape)
+    goal = goal.at[: size // 4, :2].set(next_observation[: size // 4, :2] + 0.1)  # reached
     reward, terminated = spec.task(next_observation[:, :2], goal[:, :2])
     candidate = normal(size, *spec.observation_shape)
     achieved = candidate if spec.goal_is_observation else normal(size, *spec.goal_shape)
@@ -73,6 +75,18 @@ def case(request: pytest.FixtureRequest) -> Case:
 def ris_case(request: pytest.FixtureRequest) -> Case:
     """RIS with goals that are observations, and with goals that are not."""
     return make_case("ris", request.param)
+
+
+@pytest.fixture(scope="session")
+def make_batch() -> Callable[[EnvSpec, int], Batch]:
+    """Return the function that draws a random batch for a specification."""
+    return draw_batch
+
+
+@pytest.fixture
+def pairs() -> Case:
+    """RIS with goals that are no observations, the general case."""
+    return make_case("ris", "pairs")
 
 
 @pytest.fixture
