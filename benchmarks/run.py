@@ -53,12 +53,12 @@ F32 = ("--precision", "f32")
 BF16 = ("--precision", "bf16")
 SUITES: dict[str, list[Experiment]] = {
     "point-mazes": [
-        Experiment(env, agent, seed, F32)
-        for env in POINT_MAZES
+        Experiment(env, agent, seed, BF16)
         for agent in ("ris", "sac")
+        for env in POINT_MAZES
         for seed in SEEDS
     ],
-    "precision": [Experiment("point-u", "ris", seed, BF16, "bf16") for seed in SEEDS],
+    "precision": [Experiment("point-u", "ris", seed, F32, "f32") for seed in SEEDS],
     "ant-u": [
         Experiment("ant-u", agent, 0, (*BF16, "--steps", "1000000")) for agent in ("ris", "sac")
     ],

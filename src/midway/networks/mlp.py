@@ -1,5 +1,6 @@
 """Multilayer perceptrons, with products in float32 or bfloat16."""
 
+from pathlib import Path
 from typing import Literal, TypeAlias
 
 import equinox as eqx
@@ -8,6 +9,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, BFloat16, Float, Key
 
 Precision: TypeAlias = Literal["f32", "bf16"]
+
+
+def fastest_precision() -> Precision:
+    """Return ``bf16`` where products of bfloat16 have instructions of their own, else ``f32``.
+
+    On processors that is AVX512-BF16 or AMX, on other devices it is taken for granted.
+    """
+    if jax.default_backend() != "cpu":
+        return "bf16"
+    try:
+        flags = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return "f32"
+    return "bf16" if "avx512_bf16" in flags or "amx_bf16" in flags else "f32"
 
 
 @jax.custom_vjp
