@@ -1,0 +1,206 @@
+"""The house of the design: imports point down only, and some names are never used."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import midway
+
+SOURCE = Path(midway.__file__).parent
+FILES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init__.py")
+"""All but the public face, ``midway/__init__.py``, which may name anything."""
+
+FLOORS = (
+    {"types", "functional"},
+    {"networks", "replay", "envs", "planning"},
+    {"agents"},
+    {"training", "presets", "api"},
+    {"reports", "cluster"},
+    {"cli"},
+)
+FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
+
+FORBIDDEN_IMPORTS = {"gym", "mujoco_py", "d4rl", "pickle"}
+FORBIDDEN_NAME = re.compile(r"^_*(tau|alpha|lambda)_*$", re.IGNORECASE)
+
+# Floor 3 has an order of its own: the modules that build a run out of a configuration look up its
+# preset, and a preset is a training configuration.
+API = {"api", "training.api"}
+
+# The agents are siblings that share a room: each file stands alone, but for these.
+AGENTS_MAY = {("leap", "tdm")}
+
+
+def name_of(path: Path) -> str:
+    """Return the dotted name below midway: ``agents.ris`` for agents/ris.py."""
+    parts = path.relative_to(SOURCE).with_suffix("").parts
+    return ".".join(part for part in parts if part != "__init__")
+
+
+def imports(tree: ast.AST, package: tuple[str, ...]) -> Iterator[str]:
+    """Yield every dotted name that the module imports, at its top or inside a function.
+
+    ``from midway.agents import ris`` yields ``midway.agents.ris``: a name that is no module (a
+    function) makes the dotted name one longer than a module's, which no check here minds.
+    """
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else ()
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+
+
+def imports_of(path: Path) -> Iterator[str]:
+    package = ("midway", *path.relative_to(SOURCE).parent.parts)
+    return imports(ast.parse(path.read_text()), package)
+
+
+def violations(module: str, imported: Iterator[str]) -> Iterator[str]:
+    """Yield a line for each import of the module that does not point down."""
+    room = module.split(".")[0]
+    for target in imported:
+        if target != "midway" and not target.startswith("midway."):
+            continue
+        there = target.split(".")[1:]
+        if not there or there[0] not in FLOOR:
+            yield f"{module} imports {target}, which is on no floor"
+        elif there[0] == room:
+            yield from _violations_between_agents(module, there)
+        elif FLOOR[there[0]] >= FLOOR[room] and not _is_api_order(module, there[0]):
+            yield f"{module} (floor {FLOOR[room]}) imports {target} (floor {FLOOR[there[0]]})"
+
+
+def _is_api_order(module: str, room: str) -> bool:
+    return (module in API and room in {"presets", "training"}) or (module, room) == (
+        "presets",
+        "training",
+    )
+
+
+def _violations_between_agents(module: str, there: list[str]) -> Iterator[str]:
+    room, _, importer = module.partition(".")
+    if room == "agents" and importer != "registry" and (importer, there[1]) not in AGENTS_MAY:
+        yield f"{module} imports its sibling {there[1]}"
+
+
+def identifiers(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Yield every name that the module binds, reads or passes, with its line."""
+    for node in ast.walk(tree):
+        line = getattr(node, "lineno", 0)
+        for field in ("id", "attr", "arg", "name", "asname"):
+            value = getattr(node, field, None)
+            if isinstance(value, str):
+                yield value.split(".")[-1], line
+
+
+def test_the_checks_below_see_the_package():
+    names = {name_of(path) for path in FILES}
+    assert {"types", "functional", "agents.ris", "networks.mlp", "replay.buffer"} <= names
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_every_module_stands_on_a_floor(path):
+    assert name_of(path).split(".")[0] in FLOOR
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_imports_point_down(path):
+    assert list(violations(name_of(path), imports_of(path))) == []
+
+
+def test_modules_do_not_import_each_other_in_a_circle():
+    modules = {name_of(path) for path in FILES}
+    below = {name_of(path): set(_modules_of(imports_of(path), modules)) for path in FILES}
+    rest = dict(below)
+    while leaves := [module for module, targets in rest.items() if not targets & rest.keys()]:
+        for leaf in leaves:
+            del rest[leaf]
+    assert rest == {}
+
+
+def _modules_of(imported: Iterator[str], modules: set[str]) -> Iterator[str]:
+    """Yield the modules that are meant: ``replay.buffer`` for ``midway.replay.buffer.add``."""
+    for target in imported:
+        name = target.removeprefix("midway.")
+        while name and name not in modules:
+            name = name.rpartition(".")[0]
+        if target.startswith("midway.") and name:
+            yield name
+
+
+@pytest.mark.parametrize("module", ["training.loop", "training.step", "training.collect"])
+def test_the_loop_knows_neither_agents_nor_environments(module):
+    path = SOURCE.joinpath(*module.split(".")).with_suffix(".py")
+    rooms = {target.split(".")[1] for target in imports_of(path) if target.startswith("midway.")}
+    assert rooms <= {"types", "functional", "replay", "training"}
+
+
+@pytest.mark.parametrize("path", [*FILES, SOURCE / "__init__.py"], ids=name_of)
+def test_no_forbidden_import(path):
+    roots = {target.split(".")[0] for target in imports_of(path)}
+    assert not roots & FORBIDDEN_IMPORTS
+
+
+@pytest.mark.parametrize("path", [*FILES, SOURCE / "__init__.py"], ids=name_of)
+def test_no_symbol_of_the_papers_is_an_identifier(path):
+    """Each of them means two or three things in the papers: the symbol goes to the docstring."""
+    found = [
+        f"line {line}: {name}"
+        for name, line in identifiers(ast.parse(path.read_text()))
+        if FORBIDDEN_NAME.match(name)
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        ("functional", "from midway.networks.mlp import MLP"),
+        ("networks.mlp", "import midway.agents.ris"),
+        ("networks.mlp", "from midway.replay import buffer"),
+        ("envs.registry", "from ..agents import ris"),
+        ("agents.ris", "from midway.training.loop import train"),
+        ("agents.ris", "from midway.agents import sac"),
+        ("agents.ris", "from .sac import Config"),
+        ("agents.tdm", "from midway.agents.leap import Config"),
+        ("training.loop", "def run():\n    from midway.cli.main import main"),
+        ("training.loop", "from midway.presets import PAPER"),
+        ("presets", "from midway.reports import page"),
+        ("reports.page", "from midway.cluster import sweep"),
+        ("agents.ris", "from midway import make_vec"),
+        ("agents.ris", "import midway"),
+    ],
+)
+def test_an_import_that_does_not_point_down_is_found(module, line):
+    package = ("midway", *module.split(".")[:-1])
+    assert list(violations(module, imports(ast.parse(line), package)))
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        ("networks.mlp", "from midway import functional"),
+        ("networks.policies", "from .mlp import MLP"),
+        ("agents.leap", "from midway.agents import tdm"),
+        ("agents.registry", "from midway.agents import ris, sac"),
+        ("agents.ris", "import numpy as np"),
+        ("cli.main", "from midway.training.loop import train"),
+        ("presets", "from midway.training.config import TrainConfig"),
+        ("training.api", "from midway import presets"),
+    ],
+)
+def test_an_import_that_points_down_is_allowed(module, line):
+    package = ("midway", *module.split(".")[:-1])
+    assert list(violations(module, imports(ast.parse(line), package))) == []
+
+
+def test_a_symbol_is_found_wherever_it_is_used():
+    for line in ("tau = 1", "f(alpha=1)", "def f(lambda_): pass", "x.tau", "import a as alpha"):
+        assert any(FORBIDDEN_NAME.match(name) for name, _ in identifiers(ast.parse(line)))
+    for line in ("lambda x: x", "target = 1", "alphabet = 1"):
+        assert not any(FORBIDDEN_NAME.match(name) for name, _ in identifiers(ast.parse(line)))
