@@ -75,8 +75,7 @@ def update(env: str, agent: str, batch: int, precision: str) -> Figures:
         batch: Transitions of one update.
         precision: ``f32`` or ``bf16``.
     """
-    training = _training(env, agent, batch, precision, updates_per_call=1)
-    _fill(training)
+    training = filled(env, agent, batch, precision, updates_per_call=1)
     learner, train = training.learner, training.config.train
     arguments = (training.replay, jax.random.key(0), 0)
     flops = _product_flops(learner.train, (training.arrays, training.totals, *arguments))
@@ -153,8 +152,7 @@ def replay(env: str, batch: int, capacity: int) -> Figures:
         batch: Transitions of one draw.
         capacity: Rows of the ring.
     """
-    training = _training(env, "sac", batch, "f32", 1, replay_capacity=capacity)
-    _fill(training)
+    training = filled(env, "sac", batch, "f32", 1, replay_capacity=capacity)
     observation = training.collector.observation
     actions = np.zeros((training.config.train.num_envs, training.spec.action_dim), np.float32)
     everyone = np.ones(len(actions), np.bool_)
@@ -181,8 +179,7 @@ def whole_loop(env: str, agent: str, batch: int, precision: str) -> Figures:
         batch: Transitions of one update.
         precision: ``f32`` or ``bf16``.
     """
-    training = _training(env, agent, batch, precision, updates_per_call=8)
-    _fill(training)
+    training = filled(env, agent, batch, precision, updates_per_call=8)
     learner = training.learner
 
     def turn() -> Any:
@@ -203,10 +200,19 @@ def whole_loop(env: str, agent: str, batch: int, precision: str) -> Figures:
     }
 
 
-def _training(
+def filled(
     env: str, agent: str, batch: int, precision: str, updates_per_call: int, **changes: Any
 ) -> loop.Training:
-    """Return a run of 8 environments that writes nothing."""
+    """Return a run of 8 environments that writes nothing, just before its first update.
+
+    Args:
+        env: Environment.
+        agent: Agent.
+        batch: Transitions of one update.
+        precision: ``f32`` or ``bf16``.
+        updates_per_call: Updates that one compiled call does.
+        changes: Other settings of `midway.training.config.TrainConfig`.
+    """
     settings = {
         "num_envs": 8,
         "batch_size": batch,
@@ -217,13 +223,10 @@ def _training(
         **changes,
     }
     config = api.configure(env, agent, "quick", 0, settings)
-    return api.build(config, RunFolder(Path(tempfile.gettempdir()) / "midway-bench"))
-
-
-def _fill(training: loop.Training) -> None:
-    """Collect random steps until updates begin."""
+    training = api.build(config, RunFolder(Path(tempfile.gettempdir()) / "midway-bench"))
     while training.steps < training.config.train.random_steps:
         training.advance()
+    return training
 
 
 def _product_flops(function: Any, arguments: tuple[Any, ...]) -> float:

@@ -1,0 +1,106 @@
+"""Compare SAC with hindsight replay against Stable-Baselines3, in one process, update by update.
+
+    pip install torch stable-baselines3
+    python benchmarks/speed.py [--json FILE]
+
+Both take ant-u's sizes, two hidden layers of 256 and the same batch, and both sample and relabel
+within the timed call. Their calls alternate; medians of times and of ratios are printed, so that a
+machine
+that drifts slows both alike. Run it with nothing else on the machine.
+"""
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import torch
+from stable_baselines3 import SAC, HerReplayBuffer
+
+import midway
+from midway.training import bench
+
+BATCHES = (256, 2048)
+REPETITIONS = 40
+STEPS = 20_000
+"""Random steps in each replay before anything is timed."""
+
+
+def main() -> None:
+    """Print one line for each batch size and precision."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", type=Path, help="also write the figures here")
+    arguments = parser.parse_args()
+    rows = [compare(batch, precision) for batch in BATCHES for precision in ("f32", "bf16")]
+    for row in rows:
+        print("  ".join(f"{name} {value}" for name, value in row.items()))
+    if arguments.json:
+        machine = {
+            **bench.machine(),
+            "torch": torch.__version__,
+            "threads": torch.get_num_threads(),
+        }
+        arguments.json.write_text(json.dumps({"machine": machine, "sac": rows}, indent=2) + "\n")
+
+
+def compare(batch: int, precision: str) -> dict[str, Any]:
+    """Return medians of both updates in milliseconds and of the ratio pair by pair."""
+    pieces = {"midway": ours(batch, precision), "stable_baselines3": theirs(batch)}
+    for piece in pieces.values():
+        for _ in range(3):
+            piece()
+    times: dict[str, list[float]] = {name: [] for name in pieces}
+    for _ in range(REPETITIONS):
+        for name, piece in pieces.items():
+            started = time.perf_counter()
+            piece()
+            times[name].append(1e3 * (time.perf_counter() - started))
+    pairs = zip(times["stable_baselines3"], times["midway"], strict=True)
+    ratios = [theirs / ours for theirs, ours in pairs]
+    figures = {f"{name}_ms": round(statistics.median(t), 2) for name, t in times.items()}
+    speedup = round(statistics.median(ratios), 2)
+    return {"batch": batch, "precision": precision, **figures, "speedup": speedup}
+
+
+def ours(batch: int, precision: str) -> Callable[[], None]:
+    """Return one SAC update of midway, sampling and relabelling included."""
+    training = bench.filled("ant-u", "sac", batch, precision, updates_per_call=1)
+
+    def update() -> None:
+        training.arrays, training.totals = training.learner.train(
+            training.arrays, training.totals, training.replay, jax.random.key(0), 0
+        )
+        jax.block_until_ready(training.totals)
+
+    return update
+
+
+def theirs(batch: int) -> Callable[[], None]:
+    """Return one SAC update of Stable-Baselines3 with its hindsight replay."""
+    import gymnasium
+
+    model = SAC(
+        "MultiInputPolicy",
+        gymnasium.make(midway.envs.ids.GYM_IDS["ant-u"]),
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
+        policy_kwargs={"net_arch": [256, 256]},
+        batch_size=batch,
+        learning_starts=STEPS,
+        learning_rate=1e-3,
+        device="cpu",
+    )
+    model.learn(total_timesteps=STEPS)
+
+    def update() -> None:
+        model.train(gradient_steps=1, batch_size=batch)
+
+    return update
+
+
+if __name__ == "__main__":
+    main()
