@@ -68,12 +68,6 @@ def train(
     """
     from midway.training import api
 
-    changes = {}
-    for change in set:
-        name, equals, value = change.partition("=")
-        if not equals:
-            raise ConfigurationError(f"--set {change!r}: write NAME=VALUE")
-        changes[name.replace("-", "_")] = value
     run = api.train(
         env,
         agent=agent,
@@ -83,7 +77,7 @@ def train(
         num_envs=num_envs,
         out=out,
         precision=precision,
-        changes=changes,
+        changes=_changes(set),
         progress=True,
     )
     _say_where(run)
@@ -142,16 +136,64 @@ def evaluate(
     )
 
 
+def sweep(
+    envs: Positional[tuple[str, ...]],
+    agents: tuple[str, ...] = ("ris", "sac"),
+    seeds: tuple[int, ...] = (0, 1, 2),
+    preset: str = "quick",
+    steps: OptionalCount = None,
+    out: Path = Path("runs/sweep"),
+    ray: str | None = None,
+    set: tuple[str, ...] = (),
+) -> None:
+    """Train every combination of environments, agents and seeds; typed again, it goes on.
+
+    Args:
+        envs: Environment names.
+        agents: Agent names.
+        seeds: Seeds.
+        preset: paper or quick.
+        steps: Environment steps of each run; default: the preset's.
+        out: Folder of the run folders, which `midway report` takes as it is.
+        ray: Address of a Ray cluster (auto: the one of this machine); default: this machine's
+            cores, one run on each.
+        set: Other settings of the preset, as NAME=VALUE.
+    """
+    from rich.console import Console
+    from rich.live import Live
+
+    from midway.cluster import sweep as sweeps
+    from midway.training import api
+
+    changes = _changes(set) | ({} if steps is None else {"steps": steps})
+    for env in envs:
+        for agent in agents:
+            api.configure(env, agent, preset, changes=changes)
+    options = ["--preset", preset]
+    options += ["--set", *[f"{k}={v}" for k, v in changes.items()]] if changes else []
+    with Live(console=Console(stderr=True), refresh_per_second=1) as live:
+        final = sweeps.run(
+            sweeps.jobs(envs, agents, seeds, options),
+            out,
+            lambda found: live.update(sweeps.table(found)),
+            ray,
+        )
+    failed = [status.job.name for status in final if status.state != "finished"]
+    if failed:
+        raise OSError(f"{len(failed)} runs failed ({', '.join(failed)}): see their .log in {out}")
+    print(f"finished {out}")
+
+
 def report(runs: Positional[tuple[Path, ...]], out: Path | None = None) -> None:
     """Draw figures and one HTML page from run folders.
 
     Args:
-        runs: Run folders.
+        runs: Run folders, or the folder of a sweep.
         out: Folder for the figures; default: figures in the run folder, or report beside the first.
     """
     from midway import reports
 
-    for path in reports.report(runs, out):
+    for path in reports.report(_run_folders(runs), out):
         print(path)
 
 
@@ -256,6 +298,7 @@ def doctor(json: bool = False) -> None:
 COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "resume": resume,
+    "sweep": sweep,
     "evaluate": evaluate,
     "report": report,
     "watch": watch,
@@ -329,6 +372,26 @@ def _fail(status: int, error: object) -> None:
     text = " ".join(str(error).split())
     print(f"midway: {text}", file=sys.stderr)
     sys.exit(status)
+
+
+def _changes(words: Sequence[str]) -> dict[str, str]:
+    """Return the settings of ``--set NAME=VALUE ...``."""
+    changes = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals:
+            raise ConfigurationError(f"--set {word!r}: write NAME=VALUE")
+        changes[name.replace("-", "_")] = value
+    return changes
+
+
+def _run_folders(paths: Sequence[Path]) -> list[Path]:
+    """Return the paths, with the folder of a sweep replaced by its runs."""
+    found: list[Path] = []
+    for path in paths:
+        below = sorted(config.parent for config in path.glob("*/config.json"))
+        found += below if below and not (path / "config.json").exists() else [path]
+    return found
 
 
 def _print_json(value: Any) -> None:

@@ -14,7 +14,6 @@ from midway.envs import registry as environments
 from midway.training import loop
 from midway.training import policy as policies
 from midway.training.checkpoint import Checkpoints
-from midway.training.config import TrainConfig
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.folder import RunConfig, RunFolder
 from midway.training.logging import Logger
@@ -181,6 +180,11 @@ def build(config: RunConfig, folder: RunFolder) -> loop.Training:
 
 def _run(training: loop.Training, progress: bool) -> Run:
     """Restore the newest checkpoint if there is one, then train."""
+    with training.folder.lock():
+        return _run_locked(training, progress)
+
+
+def _run_locked(training: loop.Training, progress: bool) -> Run:
     folder = training.folder
     checkpoints = Checkpoints(folder.checkpoints)
     latest = checkpoints.latest()
@@ -210,9 +214,9 @@ def _changed(config: Any, name: str, value: Any) -> Any:
             value = ast.literal_eval(value)
         except (ValueError, SyntaxError):
             raise ConfigurationError(f"{name} {value!r}: not a {type(old).__name__}") from None
-    if isinstance(old, TrainConfig) or dataclasses.is_dataclass(old):
+    if dataclasses.is_dataclass(old):
         try:
-            value = type(old)(*value)
+            value = type(old)(*value)  # type: ignore[operator]
         except TypeError:
             raise ConfigurationError(f"{name} {value!r}: one value for each share") from None
     if isinstance(old, float) and isinstance(value, int):

@@ -1,6 +1,7 @@
 """The run folder: its configuration, its files, and the versions that made it."""
 
 import dataclasses
+import fcntl
 import importlib.metadata
 import json
 import os
@@ -8,6 +9,8 @@ import platform
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -126,6 +129,32 @@ class RunFolder:
             raise ConfigurationError(
                 f"cannot make run folder {self.path}: {error.strerror}"
             ) from error
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep other processes from training the same run.
+
+        Raises:
+            ConfigurationError: Another process trains it.
+        """
+        with (self.path / "lock").open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ConfigurationError(
+                    f"run folder {self.path}: another process trains this run"
+                ) from None
+            yield
+
+    def in_use(self) -> bool:
+        """Return whether a process trains this run now."""
+        if not (self.path / "lock").exists():
+            return False
+        try:
+            with self.lock():
+                return False
+        except ConfigurationError:
+            return True
 
     def load_config(self) -> RunConfig:
         """Return the configuration of the run.

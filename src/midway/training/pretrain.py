@@ -8,7 +8,9 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
@@ -66,7 +68,7 @@ def run(
 
 
 def sample_states(env: Any, settings: Pretraining, seed: int) -> Subgoal:
-    """Return states ``(N, ...)`` soon after resets: those after each of a few random actions.
+    """Return states ``(N, ...)``: those of resets, and those after each of a few random actions.
 
     Args:
         env: A vector environment.
@@ -74,20 +76,20 @@ def sample_states(env: Any, settings: Pretraining, seed: int) -> Subgoal:
         seed: Seed of resets and actions.
     """
     generator = np.random.default_rng(seed)
-    observation, _ = env.reset(seed=seed)
-    found: dict[str, list[np.ndarray[Any, Any]]] = {"observation": [], "achieved_goal": []}
-    while len(found["observation"]) * env.num_envs < settings.states:
+    found: list[Any] = [env.reset(seed=seed)[0]]
+    while len(found) * env.num_envs < settings.states:
         for _ in range(settings.random_actions):
             actions = generator.uniform(-1, 1, env.action_space.shape).astype(np.float32)
             observation, _, terminated, truncated, _ = env.step(actions)
-            for name, parts in found.items():
-                parts.append(observation[name])
-            ended = terminated | truncated
-            if ended.any():
+            found.append(observation)
+            if (ended := terminated | truncated).any():
                 env.reset(options={"reset_mask": ended})
-        env.reset()
-    states = {name: np.concatenate(parts)[: settings.states] for name, parts in found.items()}
-    return Subgoal(**{name: jax.numpy.asarray(array) for name, array in states.items()})
+        found.append(env.reset()[0])
+
+    def all_of(name: str) -> Array:
+        return jnp.asarray(np.concatenate([part[name] for part in found])[: settings.states])
+
+    return Subgoal(all_of("observation"), all_of("achieved_goal"))
 
 
 def train(
