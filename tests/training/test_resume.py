@@ -31,6 +31,7 @@ SMALL = {
     "checkpoint_every": 100,
     "steps": 400,
 }
+MOMENTS = (52, 100, 152, 200, 252, 300, 352, 400)
 TIMES = ("seconds", "training_seconds")
 
 
@@ -218,6 +219,11 @@ def test_foreign_and_damaged_folders_are_refused(whole_run: Path, tmp_path: Path
         load(folder, midway.make_vec("point-u").goal_spec)
     with pytest.raises(ConfigurationError, match="not empty"):
         midway.train("point-u", out=whole_run)
+
+
+def test_weights_of_several_moments_are_kept(whole_run: Path) -> None:
+    kept = {path.name for path in (whole_run / "policies").iterdir()}
+    assert kept == {f"step-{step}.safetensors" for step in MOMENTS}
 
 
 def test_tensorboard_events_are_written(whole_run: Path) -> None:

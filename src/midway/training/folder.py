@@ -104,6 +104,11 @@ class RunFolder:
         return self.path / "policy.safetensors"
 
     @property
+    def past_policies(self) -> Path:
+        """Folder of the weights at some moments of training, for figures."""
+        return self.path / "policies"
+
+    @property
     def policy_config(self) -> Path:
         """``policy.json``: what is needed to build the networks."""
         return self.path / "policy.json"

@@ -32,6 +32,8 @@ from midway.types import NonFiniteError
 
 EVALUATED_TASKS = ("hard", "uniform")
 EVALUATED_ACTIONS: tuple[ActionKind, ...] = ("mean", "sampled")
+MOMENTS = 8
+"""Moments of training whose weights are kept, for figures of how the subgoals change."""
 
 MakeEnv = Callable[[int, str], Any]
 """``(number of copies, task) -> vector environment``."""
@@ -238,6 +240,8 @@ def run(training: Training, checkpoints: Checkpoints, logger: Logger, reporter: 
                 _log(training, logger, reporter, success)
             if every(train.evaluate_every):
                 success = _evaluate(training, logger, reporter)
+            if every(max(1, train.steps // MOMENTS)):
+                policies.keep(training.folder, training.config, training.state, training.steps)
             training.seconds = time.perf_counter() - started
             if every(train.checkpoint_every):
                 training.save(checkpoints)

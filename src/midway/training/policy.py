@@ -3,6 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -86,14 +87,24 @@ def _networks(agent: ModuleType, state: Any) -> dict[str, Any]:
 
 def save(folder: RunFolder, config: RunConfig, state: Any) -> None:
     """Write ``policy.safetensors`` and ``policy.json``, each whole or not at all."""
-    networks = _networks(registry.get(config.agent), state)
-    arrays = {name: np.asarray(array) for name, array in named_arrays(networks).items()}
-    temporary = folder.policy_weights.with_name("policy.safetensors.new")
-    save_file(arrays, temporary)
-    temporary.replace(folder.policy_weights)
+    _save_weights(folder.policy_weights, config, state)
     spec = dataclasses.asdict(state.spec)
     del spec["task"]
     write_json(folder.policy_config, {"format": FORMAT, **config.to_json(), "spec": spec})
+
+
+def keep(folder: RunFolder, config: RunConfig, state: Any, steps: int) -> None:
+    """Write the weights of this moment of training to ``policies/step-N.safetensors``."""
+    folder.past_policies.mkdir(exist_ok=True)
+    _save_weights(folder.past_policies / f"step-{steps}.safetensors", config, state)
+
+
+def _save_weights(path: Path, config: RunConfig, state: Any) -> None:
+    networks = _networks(registry.get(config.agent), state)
+    arrays = {name: np.asarray(array) for name, array in named_arrays(networks).items()}
+    temporary = path.with_name(path.name + ".new")
+    save_file(arrays, temporary)
+    temporary.replace(path)
 
 
 def load(folder: RunFolder, spec: EnvSpec) -> Policy:
