@@ -1,5 +1,6 @@
-"""Figures and pages drawn from run folders."""
+"""Figures, pages and videos drawn from run folders."""
 
 from midway.reports.compose import report
+from midway.reports.videos import watch
 
-__all__ = ["report"]
+__all__ = ["report", "watch"]

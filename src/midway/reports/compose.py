@@ -1,18 +1,23 @@
 """From run folders to files: the figures and the page."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from midway.reports import curves, maps, rollouts, style
+from matplotlib.figure import Figure
+
+from midway.reports import curves, difficulty, health, imagined, maps, page, style
+from midway.reports.page import Picture, Section
 from midway.reports.runs import Group, RunData, groups, read
+from midway.reports.study import Study, maze_of
 from midway.types import ConfigurationError
 
-MAP_EPISODES = {"hard": 8, "uniform": 12}
-"""Episodes of each task on a map."""
+PAGE = "report.html"
+TABLES = "data"
 
 
 def report(paths: Sequence[Path], out: Path | None = None) -> list[Path]:
-    """Draw what run folders hold.
+    """Draw what run folders hold, and one page with all of it.
 
     Args:
         paths: Run folders; agents, seeds and environments may differ.
@@ -20,7 +25,7 @@ def report(paths: Sequence[Path], out: Path | None = None) -> list[Path]:
             ``report`` beside the first one.
 
     Returns:
-        The files that were written.
+        The files that were written: the page, then the figures.
 
     Raises:
         ConfigurationError: A path is no run folder, or ``out`` cannot be written.
@@ -33,31 +38,225 @@ def report(paths: Sequence[Path], out: Path | None = None) -> list[Path]:
         out = runs[0].folder.figures if len(runs) == 1 else paths[0].resolve().parent / "report"
     try:
         out.mkdir(parents=True, exist_ok=True)
-        return [file for env in _environments(runs) for file in _draw_environment(env, runs, out)]
+        return _write(runs, out)
     except OSError as error:
         raise ConfigurationError(f"cannot write the report to {out}: {error.strerror}") from error
 
 
-def _environments(runs: Sequence[RunData]) -> list[str]:
-    return list(dict.fromkeys(run.config.env for run in runs))
+def _write(runs: Sequence[RunData], out: Path) -> list[Path]:
+    names = dict.fromkeys(run.config.env for run in runs)
+    by_env = {env: groups([run for run in runs if run.config.env == env]) for env in names}
+    overview = Album(out)
+    if len(by_env) > 1:
+        overview.add(
+            "all-learning-curves",
+            lambda: curves.draw_overview(by_env),
+            "All environments",
+            "Success of mean actions over environment steps, interquartile mean over seeds with "
+            "stratified 95 % bootstrap intervals. The last column takes all environments together.",
+            "Learning curves of every environment.",
+        )
+    chapters = [_chapter(env, gathered, out) for env, gathered in by_env.items()]
+    sections = [section for section, _ in chapters]
+    html = page.write(out / PAGE, sections, overview.pictures)
+    return [html, *overview.files, *(file for _, files in chapters for file in files)]
 
 
-def _draw_environment(env: str, runs: Sequence[RunData], out: Path) -> list[Path]:
+@dataclass
+class Album:
+    """Figures on their way to files.
+
+    Attributes:
+        out: Where the files go.
+        pictures: What the page shows.
+        files: The files that were written.
+        missing: What could not be drawn, and why.
+    """
+
+    out: Path
+    pictures: list[Picture] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+
+    def add(
+        self, name: str, draw: Callable[[], Figure], title: str, caption: str, description: str
+    ) -> None:
+        """Draw a figure and write its files."""
+        files = style.save(draw(), self.out / name)
+        self.files += files
+        self.pictures.append(Picture(files[0], title, caption, description))
+
+
+def _chapter(env: str, gathered: Sequence[Group], out: Path) -> tuple[Section, list[Path]]:
     """Draw everything about one environment."""
-    gathered = groups([run for run in runs if run.config.env == env])
-    files = style.save(curves.draw(gathered), out / f"{env}-learning-curves")
+    album = Album(out)
+    album.missing += _unfinished(gathered)
+    _add_curves(album, env, gathered)
+    maze = maze_of(env)
+    if maze is None:
+        album.missing.append(f"{env} has no maze: no maps, difficulty or values")
+    else:
+        _add_studies(album, env, gathered)
+    _add_health(album, env, gathered)
+    return Section(env, gathered, album.pictures, album.missing), album.files
+
+
+def _unfinished(gathered: Sequence[Group]) -> Iterator[str]:
+    """Yield what the runs lack."""
     for group in gathered:
-        files += _draw_map(env, group, out)
-    return files
+        if len(group.runs) == 1:
+            yield f"{group.label}: one seed, so there is no interval over seeds"
+        for run in group.runs:
+            where = f"{group.label}, seed {run.config.seed}"
+            if not run.finished:
+                yield f"{where}: unfinished, {run.steps:,} of {run.config.train.steps:,} steps"
+            if not run.evaluation:
+                yield f"{where}: no evaluation yet"
 
 
-def _draw_map(env: str, group: Group, out: Path) -> list[Path]:
-    """Draw the map of the group's first run with a policy, if there is one and a maze."""
-    maze = maps.maze_of(env)
-    run = next((run for run in group.runs if run.has_policy), None)
-    if maze is None or run is None:
-        return []
-    policy = rollouts.load(run)
-    recordings = rollouts.record(policy, MAP_EPISODES)
-    drawn = maps.draw(maze, group.label, policy, recordings)
-    return style.save(drawn, out / f"{env}-{group.slug}-map")
+def _add_curves(album: Album, env: str, gathered: Sequence[Group]) -> None:
+    if not any(run.evaluation for group in gathered for run in group.runs):
+        album.missing.append("no run has been evaluated: no learning curves")
+        return
+    album.add(
+        f"{env}-learning-curves",
+        lambda: curves.draw(gathered),
+        "Learning curves",
+        "Success over environment steps (top) and over the time spent on collection and updates, "
+        "without evaluations (bottom). Lines: one seed, or the interquartile mean of several; "
+        "shaded: its 95 % bootstrap interval. Over time, seeds are compared along straight lines "
+        "between their evaluations.",
+        f"Learning curves on {env}. Last success: "
+        + "; ".join(
+            f"{group.label} hard {page.success_text(group, 'hard')}, "
+            f"uniform {page.success_text(group, 'uniform')}"
+            for group in gathered
+        ),
+    )
+
+
+def _add_health(album: Album, env: str, gathered: Sequence[Group]) -> None:
+    shown = health.panels(gathered)
+    if not shown:
+        album.missing.append("no run has metrics yet: no training health")
+        return
+    lines = " ".join(panel.healthy for panel in shown)
+    album.add(
+        f"{env}-health",
+        lambda: health.draw(gathered),
+        "Training health",
+        "One line for each seed; the grey text says what a healthy curve looks like. "
+        "Dotted: the bounds of the values.",
+        f"{len(shown)} quantities over environment steps: "
+        f"{', '.join(panel.title for panel in shown)}. Healthy: {lines}",
+    )
+
+
+def _add_studies(album: Album, env: str, gathered: Sequence[Group]) -> None:
+    """Draw what the saved policies do and imagine."""
+    studies = {group.label: _studies(group, album) for group in gathered}
+    firsts = {group.label: (group, s[0]) for group in gathered if (s := studies[group.label])}
+    if not firsts:
+        return
+    for group, study in firsts.values():
+        _add_map(album, env, group, study)
+    _add_difficulty(album, env, gathered, studies)
+    for group, study in firsts.values():
+        if study.imagines:
+            _add_subgoals(album, env, group, study)
+    judged = {label: study for label, (_, study) in firsts.items() if study.judges}
+    if judged:
+        _add_values(album, env, judged)
+
+
+def _studies(group: Group, album: Album) -> list[Study]:
+    """Return the studies of the runs whose policies can be used."""
+    studies = []
+    for run in group.runs:
+        where = f"{group.label}, seed {run.config.seed}"
+        if not run.has_policy:
+            album.missing.append(f"{where}: no policy saved yet, so it is on no map")
+            continue
+        try:
+            study = Study(run, album.out / TABLES)
+            study.episodes()
+            studies.append(study)
+        except ConfigurationError as error:
+            album.missing.append(f"{where}: the policy cannot be used: {error}")
+    return studies
+
+
+def _seed(study: Study) -> str:
+    return f"seed {study.run.config.seed}, step {study.run.policy_step:,}"
+
+
+def _add_map(album: Album, env: str, group: Group, study: Study) -> None:
+    rates = {
+        task: page.percent(sum(e.success for e in chosen) / len(chosen))
+        for task in maps.SHOWN
+        for chosen in [[e for e in study.episodes() if e.task == task]]
+    }
+    album.add(
+        f"{env}-{group.slug}-map",
+        lambda: maps.draw(study, group.label),
+        f"{group.label} in the maze",
+        f"Ways of mean actions ({_seed(study)}). Walls are grey; an episode ends within 0.5 m of "
+        "its goal."
+        + (" The subgoals are drawn by the subgoal policy at a start." if study.imagines else ""),
+        f"Map of {env} with the ways of {group.label}; success over all recorded episodes: "
+        f"hard {rates['hard']}, uniform {rates['uniform']}.",
+    )
+
+
+def _add_difficulty(
+    album: Album, env: str, gathered: Sequence[Group], studies: dict[str, list[Study]]
+) -> None:
+    results = {
+        group.label: (group, [study.episodes() for study in studies[group.label]])
+        for group in gathered
+        if studies[group.label]
+    }
+    maze = next(study for of_group in studies.values() for study in of_group).maze
+    cases = [name for name in maze.cases if name.startswith("case-")]
+    album.add(
+        f"{env}-difficulty",
+        lambda: difficulty.draw(results, cases),
+        "Success against difficulty",
+        "Mean actions of the saved policies, the same starts and goals for all. Each bin of "
+        "uniform tasks holds as many episodes. Bars: 95 % intervals, over seeds by bootstrap; of "
+        "a single seed over its episodes (Wilson).",
+        f"Success on {env} by length of the shortest path"
+        + (" and by numbered case." if cases else "."),
+    )
+
+
+def _add_subgoals(album: Album, env: str, group: Group, study: Study) -> None:
+    moments = len(study.subgoals()["step"])
+    if moments == 1:
+        album.missing.append(
+            f"{group.label}, seed {study.run.config.seed}: no past policies were kept, so "
+            "imagined subgoals are shown at the last step only"
+        )
+    album.add(
+        f"{env}-{group.slug}-subgoals",
+        lambda: imagined.draw_subgoals(study, group.label),
+        f"What {group.label} imagines",
+        f"Where the subgoal policy puts subgoals of the hard task ({_seed(study)}), and the chain "
+        "that comes from imagining again between start, subgoals and goal: the largest mark is "
+        "the first subgoal, smaller ones halve what is left.",
+        f"Heat map of imagined subgoals at {moments} moments of training, and the subgoal chain.",
+    )
+
+
+def _add_values(album: Album, env: str, judged: dict[str, Study]) -> None:
+    configs = [study.run.config.hyperparameters for study in judged.values()]
+    bound = max(1 / (1 - config.discount) for config in configs)
+    album.add(
+        f"{env}-values",
+        lambda: imagined.draw_values(judged, bound),
+        "Value of a goal",
+        "Value of every place for the goal of the hard task, from which the agent starts at rest: "
+        "minus the discounted steps that it expects to need. Bright: near by its own reckoning; "
+        "a sound value follows the corridors, not the straight line.",
+        f"Map of the values of {', '.join(judged)} on {env}.",
+    )

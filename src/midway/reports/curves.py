@@ -1,20 +1,24 @@
 """Learning curves: success over environment steps and over training time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from midway.reports import style
 from midway.reports.runs import Group, Table
-from midway.reports.statistics import Curve, curve
+from midway.reports.statistics import Curve, Run, curve
 
 TASKS = {"hard": "hard task", "uniform": "uniform tasks"}
 LINES = {"mean": "-", "sampled": (0, (2, 1.5))}
 """Solid lines for mean actions, dashed ones for sampled actions."""
+
+MARKS = 10
+"""Marks on a long curve, about."""
 
 TIME_POINTS = 100
 """Points at which runs of different speeds are compared over time."""
@@ -39,6 +43,46 @@ def draw(groups: Sequence[Group]) -> Figure:
     return figure
 
 
+def draw_overview(environments: Mapping[str, Sequence[Group]]) -> Figure:
+    """Draw success of mean actions over steps: tasks in rows, environments in columns.
+
+    The last column is all environments together, for labels that every environment has.
+    """
+    together = {task: list(_together(environments, task)) for task in TASKS}
+    columns = len(environments) + any(together.values())
+    figure, axes = style.figure(len(TASKS), columns, height=5.2, sharey=True)
+    for row, (task, title) in enumerate(TASKS.items()):
+        panels = axes[row * columns : (row + 1) * columns]
+        for panel, (env, groups) in zip(panels, environments.items(), strict=False):
+            for group in groups:
+                _draw_group(panel, group, task, "mean", "step")
+            style.label(panel, env if row == 0 else "", "steps", f"success, {title}")
+        for group, drawn in together[task]:
+            _draw_curve(panels[-1], group, "mean", drawn)
+            style.label(panels[-1], "all together" if row == 0 else "", "steps")
+    for panel in axes:
+        style.success_axis(panel)
+        panel.set_xlim(left=0)
+        panel.xaxis.set_major_locator(MaxNLocator(4))
+        panel.xaxis.set_major_formatter(thousands)
+        panel.label_outer()
+    groups_of_labels = {g.label: g for groups in environments.values() for g in groups}
+    style.legend_below(figure, _group_entries(list(groups_of_labels.values())))
+    return figure
+
+
+def _together(
+    environments: Mapping[str, Sequence[Group]], task: str
+) -> Iterator[tuple[Group, Curve]]:
+    """Yield the curve over all environments of every label that all of them have."""
+    for first in next(iter(environments.values())):
+        same = [g for groups in environments.values() for g in groups if g.label == first.label]
+        strata = [_series(group, task, "mean", "step") for group in same]
+        if len(same) == len(environments) and all(strata):
+            steps = np.unique(np.concatenate([x for runs in strata for x, _ in runs]))
+            yield first, curve(strata, steps)
+
+
 def thousands(value: float, position: float = 0) -> str:
     """Return a number of steps in short: 8k, 1.5M."""
     for size, letter in ((1e6, "M"), (1e3, "k")):
@@ -49,14 +93,19 @@ def thousands(value: float, position: float = 0) -> str:
 
 def success_curve(group: Group, task: str, actions: str, clock: str) -> Curve | None:
     """Return success along ``step`` or ``minutes``; None before the first evaluation."""
-    tables = [run.evaluated(task, actions) for run in group.runs]
-    series = [(_clock(t, clock), t["success_rate"]) for t in tables if t and len(t["step"])]
+    series = _series(group, task, actions, clock)
     if not series:
         return None
     places = np.unique(np.concatenate([x for x, _ in series]))
     if clock != "step" and len(series) > 1:
         places = np.linspace(places[0], places[-1], TIME_POINTS)
-    return curve(series, places)
+    return curve([series], places)
+
+
+def _series(group: Group, task: str, actions: str, clock: str) -> list[Run]:
+    """Return success of every run that has been evaluated."""
+    tables = [run.evaluated(task, actions) for run in group.runs]
+    return [(_clock(t, clock), t["success_rate"]) for t in tables if t and len(t["step"])]
 
 
 def _clock(table: Table, clock: str) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -65,9 +114,12 @@ def _clock(table: Table, clock: str) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 def _draw_group(axes: Axes, group: Group, task: str, actions: str, clock: str) -> None:
     drawn = success_curve(group, task, actions, clock)
-    if drawn is None:
-        return
-    dense = len(drawn.x) > 30
+    if drawn is not None:
+        _draw_curve(axes, group, actions, drawn)
+
+
+def _draw_curve(axes: Axes, group: Group, actions: str, drawn: Curve) -> None:
+    """Draw the line; for mean actions also marks, and the interval of several runs."""
     axes.plot(
         drawn.x,
         drawn.centre,
@@ -76,15 +128,23 @@ def _draw_group(axes: Axes, group: Group, task: str, actions: str, clock: str) -
         linewidth=2,
         marker=group.marker if actions == "mean" else None,
         markersize=4,
-        markevery=max(1, len(drawn.x) // 10) if dense else 1,
+        markevery=max(1, len(drawn.x) // MARKS),
     )
-    if drawn.runs.max() > 1 and actions == "mean":
+    if actions == "mean" and len(drawn.x) and drawn.runs.max() > 1:
         band = drawn.interval
         axes.fill_between(drawn.x, band.low, band.high, color=group.colour, alpha=0.18, lw=0)
 
 
 def _legend(groups: Sequence[Group]) -> list[Line2D]:
-    names = [
+    kinds = [
+        Line2D([], [], color=style.MUTED, linewidth=2, linestyle=line, label=f"{actions} actions")
+        for actions, line in LINES.items()
+    ]
+    return _group_entries(groups) + kinds
+
+
+def _group_entries(groups: Sequence[Group]) -> list[Line2D]:
+    return [
         Line2D(
             [],
             [],
@@ -96,11 +156,6 @@ def _legend(groups: Sequence[Group]) -> list[Line2D]:
         )
         for group in groups
     ]
-    kinds = [
-        Line2D([], [], color=style.MUTED, linewidth=2, linestyle=line, label=f"{actions} actions")
-        for actions, line in LINES.items()
-    ]
-    return names + kinds
 
 
 def seeds(group: Group) -> str:

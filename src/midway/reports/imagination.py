@@ -1,4 +1,4 @@
-"""What the networks of a saved policy imagine: subgoals between a state and a goal."""
+"""What the networks of a saved policy think: subgoals between a state and a goal, and values."""
 
 from typing import Any, TypeAlias
 
@@ -6,18 +6,32 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from midway.agents import registry
 from midway.training.policy import Policy
 
 Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
 
 
-def imagines(policy: Policy) -> bool:
-    """Return whether the agent has a policy over subgoals (RIS)."""
-    return "subgoal_policy" in policy.agent.NETWORKS
+def imagines(agent: str) -> bool:
+    """Return whether the agent of this name has a policy over subgoals (RIS)."""
+    return "subgoal_policy" in registry.get(agent).NETWORKS
+
+
+def judges(agent: str) -> bool:
+    """Return whether the agent of this name has a value of a state and a goal."""
+    return hasattr(registry.get(agent), "value") or agent == "sac"
+
+
+def distribution(policy: Policy, observation: Array, goal: Array) -> tuple[Array, Array]:
+    """Return location and scale of the subgoals for each pair, as achieved goals ``(B, G)``."""
+    location, scale = _distribution(policy.state, observation, goal)
+    return _achieved(policy, location), _achieved(policy, scale)
 
 
 def subgoals(policy: Policy, observation: Array, goal: Array, count: int, seed: int = 0) -> Array:
-    """Return subgoals that the subgoal policy draws, as achieved goals ``(B, count, goal_dim)``.
+    """Return subgoals that the subgoal policy draws, as achieved goals ``(B, count, G)``.
+
+    All pairs share their noise: along an episode subgoals move and do not flicker.
 
     Args:
         policy: A policy that imagines.
@@ -26,15 +40,36 @@ def subgoals(policy: Policy, observation: Array, goal: Array, count: int, seed: 
         count: Draws for each pair.
         seed: Seed of the draws.
     """
-    location, scale = _distribution(policy.state, observation, goal)
-    noise = np.random.default_rng(seed).laplace(size=(len(location), count, location.shape[-1]))
-    drawn = np.asarray(location)[:, None] + np.asarray(scale)[:, None] * noise
-    return _achieved(policy, drawn)
+    location, scale = distribution(policy, observation, goal)
+    noise = np.random.default_rng(seed).laplace(size=(count, location.shape[-1]))
+    return np.asarray(location[:, None] + scale[:, None] * noise)
 
 
-def mean_subgoals(policy: Policy, observation: Array, goal: Array) -> Array:
-    """Return the centre of the subgoal policy for each pair ``(B, goal_dim)``."""
-    return _achieved(policy, np.asarray(_distribution(policy.state, observation, goal)[0]))
+def chain(policy: Policy, observation: Array, goal: Array, depth: int) -> Array:
+    """Return the way from a state to a goal, imagined by halving it ``depth`` times.
+
+    Args:
+        policy: A policy that imagines.
+        observation: The state ``(...)``.
+        goal: The goal ``(...)``.
+        depth: A chain of depth 1 is one subgoal; each further one imagines between the last.
+
+    Returns:
+        ``(2 ** depth - 1, G)`` achieved goals, from the state to the goal.
+    """
+    if depth == 0:
+        return np.empty((0, *goal.shape))
+    vector = np.asarray(_distribution(policy.state, observation[None], goal[None])[0])
+    middle = policy.agent.as_subgoal(policy.state.spec, vector)
+    reached, onwards = np.asarray(middle.achieved_goal), np.asarray(middle.observation)
+    before = chain(policy, observation, reached[0], depth - 1)
+    after = chain(policy, onwards[0], goal, depth - 1)
+    return np.concatenate([before, reached, after])
+
+
+def values(policy: Policy, observation: Array, goal: Array) -> Array:
+    """Return the value of each pair ``(B,)``: the smaller Q of the mean action."""
+    return np.asarray(_values(policy.agent, policy.state, observation, goal))
 
 
 @eqx.filter_jit
@@ -43,6 +78,15 @@ def _distribution(state: Any, observation: Any, goal: Any) -> tuple[Any, Any]:
     return subgoals.location, jax.numpy.exp(subgoals.log_scale)
 
 
-def _achieved(policy: Policy, vector: Array) -> Array:
+@eqx.filter_jit
+def _values(agent: Any, state: Any, observation: Any, goal: Any) -> Any:
+    pair = state.encoder(observation), state.encoder(goal)
+    if hasattr(agent, "value"):
+        return agent.value(state, *pair)
+    action = jax.numpy.tanh(state.policy(*pair).mean)
+    return state.critic(pair[0], action, pair[1]).min(0)
+
+
+def _achieved(policy: Policy, vector: Any) -> Array:
     """Return the part of predicted vectors that is an achieved goal."""
     return np.asarray(policy.agent.as_subgoal(policy.state.spec, vector).achieved_goal)

@@ -1,6 +1,6 @@
-"""Mazes from above, with what a policy does and imagines in them."""
+"""Mazes from above, with what a policy does in them."""
 
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,10 +10,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle as Patch
 from matplotlib.ticker import MultipleLocator
 
-from midway.envs.mazes import MAZES, Maze
-from midway.reports import imagination, style
-from midway.reports.rollouts import Recording
-from midway.training.policy import Policy
+from midway.envs.mazes import Maze
+from midway.reports import style
+from midway.reports.runs import row
+from midway.reports.study import Episode, Study
 
 MARGIN = 0.5
 """How much of the outer walls is drawn (m)."""
@@ -21,19 +21,33 @@ MARGIN = 0.5
 TICK = 3.0
 """Distance between numbers on both axes (m)."""
 
-PANEL_HEIGHT = 6.0
+PANEL_HEIGHT = 5.5
 """Largest height of a map (inches)."""
 
 WALL, FLOOR = "#b9bec5", "#ffffff"
 START, GOAL, SUBGOAL = style.BLACK, style.GREEN, style.ORANGE
+REACHED, FAILED = style.BLUE, style.VERMILION
+DASHES = (0, (3, 1.5))
 
 SAMPLES = 300
 """Imagined subgoals that are drawn for one start and goal."""
 
+SHOWN = {"hard": 8, "uniform": 12}
+"""Episodes on a map."""
 
-def maze_of(env: str) -> Maze | None:
-    """Return the maze of an environment such as ``ant-u``; None if it has none."""
-    return MAZES.get(env.partition("-")[2])
+
+def panels(maze: Maze, columns: int, side: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """Return a figure with maps of the maze side by side, and room (inches) for a colour bar."""
+    ratio = maze.arena.half_y / maze.arena.half_x
+    height = min((style.WIDTH - side - 0.9) / columns * ratio, PANEL_HEIGHT)
+    width = min(style.WIDTH, columns * (height / ratio + 0.4) + side + 0.5)
+    figure, axes = style.figure(1, columns, height=height + 1.2, width=width, sharey=True)
+    for each in axes:
+        draw_maze(each, maze)
+    for each in axes[1:]:
+        each.set_ylabel("")
+        each.tick_params(left=False)
+    return figure, axes
 
 
 def draw_maze(axes: Axes, maze: Maze) -> None:
@@ -42,7 +56,7 @@ def draw_maze(axes: Axes, maze: Maze) -> None:
     axes.set_facecolor(FLOOR)
     for wall in maze.walls:
         size = (2 * wall.half_x, 2 * wall.half_y)
-        axes.add_patch(Patch(wall.low, *size, facecolor=WALL, edgecolor=WALL, lw=0.5, zorder=1))
+        axes.add_patch(Patch(wall.low, *size, facecolor=WALL, edgecolor=WALL, lw=0.5, zorder=2))
     seen = maze.arena.grown(MARGIN)
     axes.set_xlim(seen.low[0], seen.high[0])
     axes.set_ylim(seen.low[1], seen.high[1])
@@ -53,46 +67,40 @@ def draw_maze(axes: Axes, maze: Maze) -> None:
     style.label(axes, x="x (m)", y="y (m)")
 
 
-def panels(maze: Maze, columns: int) -> tuple[Figure, list[Axes]]:
-    """Return a figure with maps of the maze side by side."""
-    ratio = maze.arena.half_y / maze.arena.half_x
-    height = min(style.WIDTH / columns * ratio, PANEL_HEIGHT)
-    width = min(style.WIDTH, columns * (height / ratio + 0.9))
-    figure, axes = style.figure(1, columns, height=height + 1.1, width=width)
-    for each in axes:
-        draw_maze(each, maze)
-    return figure, axes
-
-
-def draw(maze: Maze, title: str, policy: Policy, recordings: Sequence[Recording]) -> Figure:
+def draw(study: Study, label: str) -> Figure:
     """Draw trajectories on the hard task and on uniform tasks, with the imagined subgoals."""
-    figure, (hard, uniform) = panels(maze, 2)
-    chosen = {task: [r for r in recordings if r.task == task] for task in ("hard", "uniform")}
-    for axes, task in ((hard, "hard"), (uniform, "uniform")):
-        reached = sum(recording.success for recording in chosen[task])
-        axes.set_title(
-            f"{title}, {task}\n{reached} of {len(chosen[task])} episodes reach the goal",
-            fontsize=style.TEXT,
-            color=style.INK,
-        )
-        for recording in chosen[task]:
-            draw_path(axes, recording)
-    if imagination.imagines(policy):
-        first = chosen["hard"][0]
-        pair = (first.observations[:1], first.goal[None])
-        scatter_subgoals(hard, imagination.subgoals(policy, *pair, SAMPLES)[0, :, :2])
-    style.legend_below(figure, _legend(imagination.imagines(policy)))
+    figure, axes = panels(study.maze, 2)
+    for panel, (task, count) in zip(axes, SHOWN.items(), strict=True):
+        shown = [episode for episode in study.episodes() if episode.task == task][:count]
+        reached = sum(episode.success for episode in shown)
+        style.caption(panel, f"{label}, {task}", f"{reached} of {len(shown)} reach the goal")
+        for episode in shown:
+            draw_path(panel, episode)
+    if study.imagines:
+        scatter_subgoals(axes[0], sample(study))
+    style.legend_below(figure, _legend(study.imagines))
     return figure
 
 
-def draw_path(axes: Axes, recording: Recording) -> None:
+def sample(study: Study) -> Float[np.ndarray, "n 2"]:
+    """Return positions of subgoals that are imagined for the hard task (m)."""
+    last = row(study.subgoals(), -1)
+    centre, scale = (last["x"], last["y"]), (last["scale_x"], last["scale_y"])
+    return np.asarray(np.random.default_rng(0).laplace(centre, scale, (SAMPLES, 2)))
+
+
+def draw_path(axes: Axes, episode: Episode) -> None:
     """Draw one episode: start, goal and the way between them."""
-    path, goal = recording.achieved[:, :2], recording.goal[:2]
-    colour = style.BLUE if recording.success else style.VERMILION
-    line = "-" if recording.success else (0, (3, 1.5))
-    axes.plot(*path.T, color=colour, linestyle=line, linewidth=1.3, alpha=0.8, zorder=3)
-    axes.plot(*path[0], "o", color=START, markersize=6, markeredgecolor="white", zorder=5)
-    axes.plot(*goal, "*", color=GOAL, markersize=11, markeredgecolor="white", zorder=5)
+    colour, line = (REACHED, "-") if episode.success else (FAILED, DASHES)
+    axes.plot(*episode.path.T, color=colour, linestyle=line, linewidth=1.3, alpha=0.8, zorder=3)
+    draw_ends(axes, episode.path[0], episode.goal)
+
+
+def draw_ends(axes: Axes, start: Float[np.ndarray, "2"], goal: Float[np.ndarray, "2"]) -> None:
+    """Draw a start and a goal (m)."""
+    outline: dict[str, Any] = {"markeredgecolor": "white", "zorder": 6, "linestyle": ""}
+    axes.plot(*start, marker="o", color=START, markersize=6, **outline)
+    axes.plot(*goal, marker="*", color=GOAL, markersize=12, **outline)
 
 
 def scatter_subgoals(axes: Axes, positions: Float[np.ndarray, "n 2"]) -> None:
@@ -102,15 +110,21 @@ def scatter_subgoals(axes: Axes, positions: Float[np.ndarray, "n 2"]) -> None:
     )
 
 
-def _legend(subgoals: bool) -> list[Line2D]:
-    entries = [
-        Line2D([], [], color=style.BLUE, label="reached the goal"),
-        Line2D([], [], color=style.VERMILION, linestyle=(0, (3, 1.5)), label="did not"),
+def ends_legend() -> list[Line2D]:
+    """Return the entries of start and goal."""
+    return [
         Line2D([], [], color=START, marker="o", linestyle="", label="start"),
         Line2D([], [], color=GOAL, marker="*", markersize=11, linestyle="", label="goal"),
     ]
+
+
+def _legend(subgoals: bool) -> list[Line2D]:
+    entries = [
+        Line2D([], [], color=REACHED, label="reaches the goal"),
+        Line2D([], [], color=FAILED, linestyle=DASHES, label="does not"),
+        *ends_legend(),
+    ]
     if subgoals:
-        entries.append(
-            Line2D([], [], color=SUBGOAL, marker="D", linestyle="", label="imagined subgoals")
-        )
+        name = "subgoals imagined at the start"
+        entries.append(Line2D([], [], color=SUBGOAL, marker="D", linestyle="", label=name))
     return entries

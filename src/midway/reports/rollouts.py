@@ -7,14 +7,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from midway.envs import registry as environments
-from midway.reports.runs import RunData
-from midway.training import policy as policies
 from midway.training.policy import Policy
 
 Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
-
-SEED = 20_210_718
-"""Seed of starts and goals in figures: the same for every run, and met in no training."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +38,7 @@ class Recording:
         return len(self.observations) - 1
 
 
-def load(run: RunData) -> Policy:
-    """Return the saved policy of a run.
-
-    Raises:
-        ConfigurationError: The policy is missing, damaged or foreign.
-    """
-    return policies.load(run.folder, environments.make_vec(run.config.env).goal_spec)
-
-
-def record(policy: Policy, episodes: Mapping[str, int], seed: int = SEED) -> list[Recording]:
+def record(policy: Policy, episodes: Mapping[str, int], seed: int) -> list[Recording]:
     """Run episodes with mean actions, all at once.
 
     Args:
@@ -65,9 +51,10 @@ def record(policy: Policy, episodes: Mapping[str, int], seed: int = SEED) -> lis
     observation = _reset(env, tasks, seed)
     goals = observation["desired_goal"].copy()
     states = [{name: observation[name].copy() for name in ("observation", "achieved_goal")}]
+    actor = policy.actor()
     ends: dict[int, tuple[int, bool, float]] = {}
     while len(ends) < len(tasks):
-        action = policy(observation["observation"], observation["desired_goal"])
+        action = actor(observation["observation"], observation["desired_goal"])
         observation, _, terminated, truncated, info = env.step(action)
         states.append({name: observation[name].copy() for name in states[0]})
         ended = terminated | truncated
@@ -77,6 +64,7 @@ def record(policy: Policy, episodes: Mapping[str, int], seed: int = SEED) -> lis
         if ended.any():
             # Copies that are done go round again, unrecorded, until the last one has ended.
             observation, _ = env.reset(options={"reset_mask": ended})
+            actor.restart(ended)
     return [
         Recording(
             str(task),

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,12 @@ from midway.types import ConfigurationError
 
 Table: TypeAlias = dict[str, np.ndarray[Any, Any]]
 """Columns by name: float64, or text for the columns of ``TEXT_COLUMNS``."""
+
+Row: TypeAlias = dict[str, float]
+"""One row of numbers by column."""
+
+WATCHING = ("steps", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every")
+"""Settings that a run does not learn from."""
 
 TEXT_COLUMNS = ("task", "actions")
 
@@ -54,6 +61,20 @@ class RunData:
         return self.folder.policy_weights.exists() and self.folder.policy_config.exists()
 
     @property
+    def policy_step(self) -> int:
+        """The step that the policy was saved at, together with the newest checkpoint."""
+        folder = self.folder.checkpoints
+        names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
+        return max((int(name) for name in names if name.isdigit()), default=self.steps)
+
+    @property
+    def past_weights(self) -> dict[int, Path]:
+        """Weights that were kept before the policy was saved, by step."""
+        files = self.folder.past_policies.glob("step-*.safetensors")
+        steps = {int(file.stem.removeprefix("step-")): file for file in files}
+        return {step: steps[step] for step in sorted(steps) if step < self.policy_step}
+
+    @property
     def name(self) -> str:
         """The run in file names and lists."""
         return f"{self.config.env}-{self.config.agent}-seed{self.config.seed}"
@@ -68,15 +89,17 @@ class RunData:
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ in their seed only.
+    """Runs that differ in their seed, and in nothing else that they learn from.
 
     Attributes:
+        slug: Name in file names, such as ``ris``, or ``ris-2`` for other settings.
         label: Name in legends, such as ``RIS``.
         colour: Its colour in every figure.
         marker: Its mark in every figure.
         runs: The runs, by seed.
     """
 
+    slug: str
     label: str
     colour: str
     marker: str
@@ -86,12 +109,6 @@ class Group:
     def agent(self) -> str:
         """Name of the agent."""
         return self.runs[0].config.agent
-
-    @property
-    def slug(self) -> str:
-        """The label in file names."""
-        kept = "".join(c if c.isalnum() or c in ".-" else " " for c in self.label.lower())
-        return "-".join(kept.split())
 
 
 def read(path: Path) -> RunData:
@@ -128,28 +145,41 @@ def read_table(path: Path) -> Table:
         whole = [row for row in rows if len(row) == len(header)]
         columns = dict(zip(header, zip(*whole, strict=True), strict=False))
         return {
-            name: np.array(values) if name in TEXT_COLUMNS else np.array(values, np.float64)
+            name: np.array(values) if name in TEXT_COLUMNS else _numbers(values)
             for name, values in columns.items()
         }
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"{path} cannot be read: {error}") from error
 
 
+def _numbers(values: Sequence[str]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return numbers; NaN where a row has none."""
+    return np.array([value or "nan" for value in values], np.float64)
+
+
+def row(table: Table, place: int) -> Row:
+    """Return one row of a table of numbers; -1 is the last."""
+    return {name: float(column[place]) for name, column in table.items()}
+
+
 def groups(runs: Sequence[RunData]) -> list[Group]:
-    """Return runs of one environment, grouped by everything but seed and number of steps."""
+    """Return runs of one environment, grouped by all that they learn from but the seed."""
     by_settings: dict[str, list[RunData]] = {}
     for run in runs:
         by_settings.setdefault(repr(_settings(run.config)), []).append(run)
     gathered = sorted(by_settings.values(), key=lambda group: _order(group[0].config.agent))
     colours = iter(style.SPARE_COLOURS * len(gathered))
+    counts: Counter[str] = Counter()
     found: list[Group] = []
     for number, members in enumerate(gathered):
         agent = members[0].config.agent
         rivals = [other[0].config for other in gathered if other[0].config.agent == agent]
-        first = all(group.agent != agent for group in found)
+        counts[agent] += 1
+        first = counts[agent] == 1
         colour = style.AGENT_COLOURS.get(agent) if first else None
         found.append(
             Group(
+                slug=agent if first else f"{agent}-{counts[agent]}",
                 label=", ".join([agent.upper(), *_differences(members[0].config, rivals)]),
                 colour=colour or next(colours),
                 marker=style.MARKERS[number % len(style.MARKERS)],
@@ -168,7 +198,7 @@ def _order(agent: str) -> int:
 def _settings(config: RunConfig) -> dict[str, Any]:
     """Return all values that runs of one group share."""
     train = dataclasses.asdict(config.train)
-    del train["steps"]
+    train = {name: value for name, value in train.items() if name not in WATCHING}
     values = {**train, **dataclasses.asdict(config.hyperparameters)}
     return {"agent": config.agent, "preset": config.preset, **values}
 

@@ -1,11 +1,14 @@
 """Interquartile mean over runs, with stratified bootstrap intervals (Agarwal et al., 2021)."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
+
+Run: TypeAlias = tuple[Float[np.ndarray, " ..."], Float[np.ndarray, " ..."]]
+"""Points (x, y) of one run."""
 
 RESAMPLES = 2_000
 CONFIDENCE = 0.95
@@ -72,22 +75,25 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
     return float(result.low), float(result.high)
 
 
-def curve(
-    series: Sequence[tuple[Float[np.ndarray, " ..."], Float[np.ndarray, " ..."]]],
-    x: Float[np.ndarray, " points"],
-) -> Curve:
-    """Return the interquartile mean of runs ``(x, y)`` at the points x.
+def curve(strata: Sequence[Sequence[Run]], x: Float[np.ndarray, " points"]) -> Curve:
+    """Return the interquartile mean of runs along x.
 
-    A run counts between its first and its last point, with straight lines between its points.
+    Args:
+        strata: The runs of each environment. A run counts between its first and its last point,
+            with straight lines between its points.
+        x: Points of the curve; those that some environment has no run at are left out.
     """
-    values = np.stack([np.interp(x, *run, left=np.nan, right=np.nan) for run in series])
-    reached = np.isfinite(values)
-    x, values, reached = x[reached.any(0)], values[:, reached.any(0)], reached[:, reached.any(0)]
+    values = [
+        np.stack([np.interp(x, *run, left=np.nan, right=np.nan) for run in runs]) for runs in strata
+    ]
+    kept = np.all([np.isfinite(stratum).any(axis=0) for stratum in values], axis=0)
+    values = [stratum[:, kept] for stratum in values]
+    reached = np.isfinite(np.concatenate(values))
+    centre, low, high = np.empty((3, kept.sum()))
     rng = np.random.default_rng(0)
-    centre, low, high = np.empty((3, len(x)))
     for present in np.unique(reached, axis=1).T:
         points = (reached == present[:, None]).all(axis=0)
-        chosen = values[np.ix_(present, points)]
-        centre[points] = interquartile_mean(chosen)
-        low[points], high[points] = bootstrap([chosen], rng)
-    return Curve(x, centre, Interval(low, high), reached.sum(axis=0))
+        chosen = [v[:, points][np.isfinite(v[:, points]).all(axis=1)] for v in values]
+        centre[points] = interquartile_mean(np.concatenate(chosen))
+        low[points], high[points] = bootstrap(chosen, rng)
+    return Curve(x[kept], centre, Interval(low, high), reached.sum(axis=0))

@@ -1,5 +1,6 @@
 """How figures look: size, colours, labels. Drawn through matplotlib's objects, without pyplot."""
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,12 @@ WIDTH = 9.0
 
 RESOLUTION = 150
 """Pixels per inch of PNG files."""
+
+NARROW, WIDE = 30, 44
+"""Letters in a line of a panel's title and of a legend's entry, at most."""
+
+LEGEND_LETTERS = 150
+"""Letters in a line of a legend."""
 
 TEXT, SMALL = 10.0, 8.5
 """Sizes of titles and axis labels, and of everything else (points)."""
@@ -63,18 +70,29 @@ def label(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
     axes.set_ylabel(y, fontsize=TEXT, color=INK)
 
 
+def caption(axes: Axes, *lines: str) -> None:
+    """Write a title in the middle, for panels that look alike."""
+    wrapped = [textwrap.fill(line, NARROW) for line in lines]
+    axes.set_title("\n".join(wrapped), fontsize=TEXT, color=INK)
+
+
 def success_axis(axes: Axes) -> None:
     """Let y run from 0 to 100 % with room for the lines at both ends."""
     axes.set_ylim(-0.03, 1.03)
     axes.set_yticks(np.linspace(0, 1, 5), ["0 %", "25 %", "50 %", "75 %", "100 %"])
 
 
-def legend_below(drawn: Figure, handles: Sequence[Any], columns: int = 6) -> None:
-    """Put one legend under all panels."""
+def legend_below(drawn: Figure, handles: Sequence[Any], title: str = "") -> None:
+    """Put one legend under all panels; long names take several lines."""
+    names = [textwrap.fill(handle.get_label(), WIDE) for handle in handles]
+    columns = LEGEND_LETTERS // (max(map(len, names)) + 6)
     drawn.legend(
-        handles=list(handles),
+        list(handles),
+        names,
         loc="outside lower center",
-        ncols=min(columns, len(handles)),
+        ncols=max(1, min(columns, len(handles))),
+        title=title,
+        title_fontsize=SMALL + 0.5,
         frameon=False,
         fontsize=SMALL + 0.5,
         labelcolor=INK,
@@ -85,5 +103,6 @@ def save(drawn: Figure, path: Path) -> list[Path]:
     """Write ``path`` as PNG and as SVG; return both files."""
     files = [path.with_name(path.name + suffix) for suffix in (".png", ".svg")]
     drawn.savefig(files[0], dpi=RESOLUTION, facecolor="white")
+    drawn.set_layout_engine("none")  # the places of the panels are found; once is enough
     drawn.savefig(files[1], dpi=RESOLUTION, facecolor="white", metadata={"Date": None})
     return files

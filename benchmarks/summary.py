@@ -1,0 +1,62 @@
+"""Print a table of the results of a suite, one row for each environment and agent.
+
+    python benchmarks/summary.py benchmarks/results/point-mazes
+
+Success is that of the last evaluation, lowest and highest of all seeds. Minutes are training time
+until an evaluation on the hard task first reached 95 % with mean actions, of the slowest seed.
+"""
+
+import argparse
+import csv
+import json
+from collections import defaultdict
+from pathlib import Path
+
+Rows = list[dict[str, str]]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("suite", type=Path, help="folder of results")
+    groups: dict[tuple[str, str, str], list[Rows]] = defaultdict(list)
+    for folder in sorted(parser.parse_args().suite.iterdir()):
+        config = json.loads((folder / "config.json").read_text())
+        with (folder / "evaluation.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        key = config["env"], config["agent"], config["hyperparameters"]["precision"]
+        groups[key].append(rows)
+    print(
+        "| environment | agent | precision | seeds | steps | hard, mean | hard, sampled | ", end=""
+    )
+    print("uniform, mean | minutes to 95 % |")
+    print("| --- " * 9 + "|")
+    for (env, agent, precision), runs in groups.items():
+        steps = max(int(rows[-1]["step"]) for rows in runs)
+        cells = [env, agent, precision, str(len(runs)), str(steps)]
+        for task, actions in (("hard", "mean"), ("hard", "sampled"), ("uniform", "mean")):
+            last = [float(of(rows, task, actions)[-1]["success_rate"]) for rows in runs]
+            low, high = round(100 * min(last)), round(100 * max(last))
+            cells.append(f"{low} %" if low == high else f"{low}-{high} %")
+        print("| " + " | ".join([*cells, minutes(runs)]) + " |")
+
+
+def of(rows: Rows, task: str, actions: str) -> Rows:
+    """Return the evaluations of one task and kind of action."""
+    return [row for row in rows if (row["task"], row["actions"]) == (task, actions)]
+
+
+def minutes(runs: list[Rows]) -> str:
+    """Return when the slowest seed reached 95 %, or how many did."""
+    reached = []
+    for rows in runs:
+        good = [row for row in of(rows, "hard", "mean") if float(row["success_rate"]) >= 0.95]
+        if good:
+            reached.append(float(good[0]["training_seconds"]) / 60)
+    if len(reached) < len(runs):
+        return f"{len(reached)} of {len(runs)} seeds"
+    return f"{max(reached):.1f}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""Success against difficulty: the length of the shortest path, and the numbered cases."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Int
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from midway.reports import style
+from midway.reports.runs import Group
+from midway.reports.statistics import bootstrap, interquartile_mean, wilson
+from midway.reports.study import Episode
+
+BINS = 6
+"""Bins of geodesic distance."""
+
+TASKS = ("uniform", "hard")
+
+Seeds: TypeAlias = list[list[Episode]]
+"""Episodes of each seed; starts and goals are the same for every seed."""
+
+
+def draw(results: Mapping[str, tuple[Group, Seeds]], cases: Sequence[str]) -> Figure:
+    """Draw success over the geodesic distance, and over the numbered cases where there are any.
+
+    Args:
+        results: Groups and the episodes of their seeds, by label.
+        cases: Names of the numbered cases of the maze, by difficulty.
+    """
+    columns = 2 if cases else 1
+    width = style.WIDTH if cases else 0.62 * style.WIDTH
+    figure, axes = style.figure(1, columns, height=3.9, width=width, sharey=True)
+    _draw_bins(axes[0], results)
+    if cases:
+        _draw_cases(axes[1], results, cases)
+    for panel in axes:
+        style.success_axis(panel)
+    style.legend_below(figure, [_entry(group, seeds) for group, seeds in results.values()])
+    return figure
+
+
+def bins(episodes: Sequence[Episode]) -> Int[np.ndarray, " episodes"]:
+    """Return the bin of each episode, by the length of its shortest path; all hold as many."""
+    rank = np.argsort(np.argsort([episode.geodesic for episode in episodes], kind="stable"))
+    return np.asarray(rank * BINS // len(episodes))
+
+
+def summary(
+    successes: Sequence[Bool[np.ndarray, " episodes"]],
+) -> tuple[float, float, float]:
+    """Return success with the ends of its 95 % interval.
+
+    Of several seeds: interquartile mean and bootstrap interval of their rates. Of one seed: its
+    rate and the Wilson interval of its episodes.
+    """
+    if len(successes) == 1:
+        low, high = wilson(int(successes[0].sum()), len(successes[0]))
+        return float(successes[0].mean()), low, high
+    rates = np.array([[seed.mean()] for seed in successes])
+    interval = bootstrap([rates], np.random.default_rng(0))
+    return float(interquartile_mean(rates)[0]), float(interval.low[0]), float(interval.high[0])
+
+
+def _draw_bins(axes: Axes, results: Mapping[str, tuple[Group, Seeds]]) -> None:
+    """Draw uniform tasks by distance, and the hard task as a hollow mark."""
+    for place, (group, seeds) in enumerate(results.values()):
+        uniform, hard = ([[e for e in s if e.task == task] for s in seeds] for task in TASKS)
+        members = bins(uniform[0])
+        aside = 2.5 * _aside(place, len(results))
+        points = []
+        for number in range(BINS):
+            chosen = [[e for e, b in zip(s, members, strict=True) if b == number] for s in uniform]
+            if chosen[0]:
+                points.append((_distance(chosen) + aside, *summary(_successes(chosen))))
+        _draw_points(axes, group, points)
+        _draw_points(axes, group, [(_distance(hard) + aside, *summary(_successes(hard)))], "white")
+    axes.set_xlim(left=0)
+    style.label(axes, "Uniform tasks, and hard (hollow)", "shortest path from start to goal (m)")
+
+
+def _distance(seeds: Seeds) -> float:
+    """Return the mean length of the shortest paths (m), the same for all seeds."""
+    return float(np.mean([episode.geodesic for episode in seeds[0]]))
+
+
+def _draw_cases(
+    axes: Axes, results: Mapping[str, tuple[Group, Seeds]], cases: Sequence[str]
+) -> None:
+    metres = []
+    for place, (group, seeds) in enumerate(results.values()):
+        points = []
+        for number, case in enumerate(cases):
+            chosen = [[e for e in seed if e.task == case] for seed in seeds]
+            middle = number + _aside(place, len(results))
+            points.append((middle, *summary(_successes(chosen))))
+            metres.append(_distance(chosen))
+        _draw_points(axes, group, points)
+    names = [case.removeprefix("case-") for case in cases]
+    ticks = [f"{name}\n{distance:.0f} m" for name, distance in zip(names, metres, strict=False)]
+    axes.set_xticks(range(len(cases)), ticks)
+    style.label(axes, "Numbered cases of the paper", "case, and its mean shortest path")
+
+
+def _successes(seeds: Seeds) -> list[Bool[np.ndarray, " episodes"]]:
+    return [np.array([episode.success for episode in seed], np.bool_) for seed in seeds]
+
+
+def _aside(place: int, groups: int) -> float:
+    """Return how far a group's points stand from the middle, so that intervals do not overlap."""
+    return 0.12 * (place - (groups - 1) / 2)
+
+
+def _draw_points(
+    axes: Axes,
+    group: Group,
+    points: Sequence[tuple[float, float, float, float]],
+    fill: str | None = None,
+) -> None:
+    """Draw points (x, centre, low, high) with their intervals; ``fill`` is the marks' inside."""
+    x, centre, low, high = np.array(points).T
+    look: dict[str, Any] = {"color": group.colour, "marker": group.marker, "linewidth": 1.8}
+    errors = np.maximum([centre - low, high - centre], 0)
+    look |= {"markersize": 6, "markerfacecolor": fill or group.colour, "elinewidth": 1}
+    axes.errorbar(x, centre, errors, **look, capsize=3)
+
+
+def _entry(group: Group, seeds: Seeds) -> Line2D:
+    count = "1 seed" if len(seeds) == 1 else f"{len(seeds)} seeds"
+    return Line2D(
+        [],
+        [],
+        color=group.colour,
+        marker=group.marker,
+        linewidth=2,
+        label=f"{group.label} ({count})",
+    )

@@ -1,0 +1,47 @@
+"""The page in a real browser; needs Debian's chromium, which ``make test`` does not install."""
+
+import re
+import shutil
+import subprocess
+
+import pytest
+
+from midway.reports import report
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+
+LOOK = """<script>
+addEventListener("load", () => {
+  const images = [...document.images];
+  const loaded = images.filter(i => i.complete && i.naturalWidth > 500 && i.alt).length;
+  const fetched = performance.getEntriesByType("resource").filter(e => !e.name.startsWith("data:"));
+  const wide = document.documentElement.scrollWidth - innerWidth;
+  document.title = `images ${images.length} loaded ${loaded} fetched ${fetched.length}` +
+    ` wide ${wide}`;
+});
+</script>"""
+
+
+@pytest.mark.skipif(
+    BROWSER is None, reason="no chromium on this machine: apt-get install chromium to run it"
+)
+@pytest.mark.parametrize("width", [1280, 500])
+def test_the_page_opens_in_a_browser(ris_run, tmp_path, width):
+    page, *_ = report([ris_run], tmp_path / "out")
+    page.write_text(page.read_text().replace("</body>", LOOK + "</body>"))
+    command = [
+        BROWSER,
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--enable-logging=stderr",
+    ]
+    command += ["--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'profile'}"]
+    command += [f"--window-size={width},900", "--virtual-time-budget=5000", "--dump-dom"]
+    done = subprocess.run(
+        [*command, page.as_uri()], capture_output=True, text=True, timeout=300, check=True
+    )
+    title = re.search("<title>(.*?)</title>", done.stdout)
+    assert title is not None
+    assert title[1] == "images 6 loaded 6 fetched 0 wide 0"
+    assert "CONSOLE" not in done.stderr

@@ -1,0 +1,197 @@
+"""Every figure and the page, from tiny runs."""
+
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from midway.envs.mazes import MAZES
+from midway.reports import compose, maps, report, study
+from midway.reports.difficulty import bins
+from midway.reports.health import PANELS, with_speed
+from midway.reports.imagined import density, halvings
+from midway.reports.study import Episode, Study
+
+FIGURES = {"learning-curves", "ris-map", "difficulty", "ris-subgoals", "values", "health"}
+
+
+class Page(HTMLParser):
+    """Collects what the tests ask of a page."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.images, self.links, self.words = [], [], []
+        self.text = path.read_text()
+        self.feed(self.text)
+        self.close()
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        if tag == "img":
+            self.images.append(values)
+        self.links += [v for k, v in attributes if k in ("src", "href")]
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def single(ris_run, tmp_path_factory):
+    out = tmp_path_factory.mktemp("single")
+    return report([ris_run], out)
+
+
+def test_one_run_gives_every_figure(single):
+    page, *figures = single
+    assert page.name == "report.html"
+    assert {f.stem.removeprefix("point-u-") for f in figures} == FIGURES
+    assert {f.suffix for f in figures} == {".png", ".svg"}
+    for file in figures:
+        if file.suffix == ".png":
+            pixels = matplotlib.image.imread(file)[..., :3]
+            assert pixels.shape[1] > 500
+            assert pixels.std() > 0.05
+        else:
+            assert "</svg>" in file.read_text()[-200:]
+
+
+def test_the_page_stands_alone(single):
+    page = Page(single[0])
+    assert len(page.images) == len(FIGURES)
+    for image in page.images:
+        assert image["src"].startswith("data:image/png;base64,")
+        assert len(image["alt"]) > 30
+    assert all(link.startswith(("data:", "#")) for link in page.links)
+    assert not re.search(r"https?:|@import|url\(|<script", page.text)
+    assert '<html lang="en">' in page.text
+
+
+def test_the_page_says_how_the_run_was_made_and_what_is_missing(single, ris_run):
+    words = "".join(Page(single[0]).words)
+    for expected in (str(ris_run), "batch_size", "jax 0.", "one seed"):
+        assert expected in words
+    assert "unfinished" not in words
+
+
+def test_default_places(ris_run, copy_run, monkeypatch):
+    asked = []
+    monkeypatch.setattr(compose, "_write", lambda runs, out: asked.append(out) or [])
+    run = copy_run(ris_run, "run")
+    report([run])
+    report([run, copy_run(ris_run, "other", seed=1)])
+    assert asked == [run / "figures", run.parent / "report"]
+
+
+def test_several_agents_and_seeds_and_a_run_in_progress(ris_run, sac_run, copy_run, tmp_path):
+    runs = [ris_run, copy_run(ris_run, "b", seed=1, until=800), copy_run(sac_run, "c")]
+    (runs[1] / "policy.safetensors").unlink()
+    page, *figures = report([*runs, runs[0]], tmp_path / "out")
+    names = {figure.stem.removeprefix("point-u-") for figure in figures}
+    assert names == FIGURES | {"sac-map"}
+    words = "".join(Page(page).words)
+    assert "RIS, seed 1: unfinished, 800 of 1,200 steps" in words
+    assert "RIS, seed 1: no policy saved yet" in words
+    assert "SAC: one seed" in words
+    assert "RIS: one seed" not in words
+
+
+def test_a_run_that_has_just_begun(ris_run, copy_run, tmp_path):
+    run = copy_run(ris_run, "young", until=0)
+    for name in ("policy.safetensors", "metrics.csv", "evaluation.csv"):
+        (run / name).unlink()
+    files = report([run], tmp_path / "out")
+    assert [file.name for file in files] == ["report.html"]
+    words = "".join(Page(files[0]).words)
+    for expected in ("0 of 1,200", "no learning curves", "no training health", "no policy saved"):
+        assert expected in words
+
+
+def test_a_damaged_policy_is_reported_and_the_rest_is_drawn(ris_run, copy_run, tmp_path):
+    run = copy_run(ris_run, "damaged")
+    (run / "policy.safetensors").write_bytes(b"no weights")
+    page, *figures = report([run], tmp_path / "out")
+    assert {f.stem.removeprefix("point-u-") for f in figures} == {"learning-curves", "health"}
+    assert "the policy cannot be used" in page.read_text()
+
+
+def test_several_environments_have_an_overview(ris_run, copy_run, tmp_path):
+    other = copy_run(ris_run, "s")
+    for name in ("config.json", "policy.json"):
+        file = other / name
+        file.write_text(file.read_text().replace("point-u", "point-s"))
+    files = report([ris_run, other], tmp_path / "out")
+    assert "all-learning-curves.png" in {file.name for file in files}
+    assert len(Page(files[0]).images) == 1 + 2 * len(FIGURES)
+
+
+def test_a_second_report_computes_nothing_again(single, ris_run, tmp_path, monkeypatch):
+    out = shutil.copytree(single[0].parent, tmp_path / "out")
+    monkeypatch.setattr(study.policies, "load", None)
+    report([ris_run], out)
+
+
+def test_past_policies_are_moments_of_the_heat_map(ris_run, tmp_path):
+    """The run keeps eight moments; the policy is the last of them."""
+    run = compose.read(ris_run)
+    assert list(run.past_weights) == [152, 304, 456, 600, 752, 904, 1056]
+    looked = Study(run, tmp_path)
+    assert looked.subgoals()["step"].tolist() == [152, 600, 1056, 1200]
+    assert len(looked.chain()["x"]) == 7
+
+
+def test_without_past_policies_the_page_says_so(ris_run, copy_run, tmp_path):
+    run = copy_run(ris_run, "run")
+    shutil.rmtree(run / "policies")
+    page, *figures = report([run], tmp_path / "out")
+    assert len(figures) == 2 * len(FIGURES)
+    assert "no past policies were kept" in page.read_text()
+
+
+def test_the_maze_is_drawn_as_it_is():
+    maze = MAZES["omega"]
+    _, (axes,) = maps.panels(maze, 1)
+    drawn = {(*patch.get_xy(), patch.get_width(), patch.get_height()) for patch in axes.patches}
+    assert drawn == {(*wall.low, 2 * wall.half_x, 2 * wall.half_y) for wall in maze.walls}
+    assert axes.get_aspect() == 1
+
+
+def test_values_cover_the_arena(ris_run, tmp_path):
+    table = Study(compose.read(ris_run), tmp_path).values()
+    assert (table["x"].min(), table["x"].max()) == (-3.75, 3.75)
+    assert (table["y"].min(), table["y"].max()) == (-9, 9)
+    assert np.isfinite(table["value"]).all()
+
+
+def test_difficulty_bins_hold_as_many_episodes_in_order_of_distance():
+    lengths = [5.0, 1.0, 9.0, 2.0, 7.0, 7.0, 3.0, 8.0, 4.0, 6.0, 10.0, 11.0]
+    episodes = [Episode("uniform", np.zeros((1, 2)), np.zeros(2), True, d) for d in lengths]
+    assert bins(episodes).tolist() == [2, 0, 4, 0, 3, 3, 1, 4, 1, 2, 5, 5]
+
+
+def test_density_of_a_laplace_subgoal():
+    row = {"x": 1.0, "y": 0.0, "scale_x": 1.0, "scale_y": 2.0}
+    heat = density(row, np.array([1.0, 2.0]), np.array([0.0, 2.0]))
+    np.testing.assert_allclose(heat, np.exp([[0, -1], [-1, -2]]))
+
+
+def test_the_middle_of_a_chain_was_imagined_first():
+    assert [halvings(place) for place in range(1, 8)] == [0, 1, 0, 2, 0, 1, 0]
+
+
+def test_updates_per_second():
+    table = {"updates": np.array([10.0, 30.0, 60.0]), "training_seconds": np.array([5.0, 9.0, 9.0])}
+    assert with_speed(table)["updates/s"][1] == 5
+    assert np.isnan(with_speed(table)["updates/s"][[0, 2]]).all()
+
+
+def test_every_panel_says_what_is_healthy():
+    for panel in PANELS:
+        assert 20 < len(panel.healthy) < 110
+
+
+def test_reports_leave_the_run_as_it_is(ris_run, single):
+    assert not (Path(ris_run) / "figures").exists()

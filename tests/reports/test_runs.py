@@ -1,0 +1,87 @@
+"""Reading run folders and grouping them."""
+
+import dataclasses
+
+import pytest
+
+from midway.reports import report
+from midway.reports.runs import groups, read, read_table
+from midway.types import ConfigurationError
+
+
+def with_config(run, **changes):
+    return dataclasses.replace(run, config=dataclasses.replace(run.config, **changes))
+
+
+def test_a_run_is_read(ris_run):
+    run = read(ris_run)
+    assert run.finished
+    assert run.steps == 1_200
+    assert run.has_policy
+    assert run.name == "point-u-ris-seed0"
+    assert run.record["versions"]["midway"]
+    hard = run.evaluated("hard", "mean")
+    assert hard["step"].tolist() == [400, 800, 1200]
+
+
+def test_a_line_that_is_being_written_is_left_out(tmp_path):
+    file = tmp_path / "metrics.csv"
+    file.write_text("step,loss\n1,0.5\n2,\n3")
+    table = read_table(file)
+    assert table["step"].tolist() == [1, 2]
+    assert table["loss"][0] == 0.5
+    assert table["loss"][1] != table["loss"][1]
+
+
+@pytest.mark.parametrize("text", ["", "step,loss\n", "step,loss\n1"])
+def test_a_table_without_rows_has_no_columns(tmp_path, text):
+    file = tmp_path / "metrics.csv"
+    file.write_text(text)
+    assert read_table(file) == {}
+    assert read_table(tmp_path / "missing.csv") == {}
+
+
+def test_seeds_are_one_group_and_settings_another(ris_run, sac_run):
+    run = read(ris_run)
+    seeds = [with_config(run, seed=seed) for seed in (1, 0)]
+    settings = dataclasses.replace(run.config.hyperparameters, kl_weight=0.5)
+    other = with_config(run, hyperparameters=settings)
+    found = groups([read(sac_run), *seeds, other])
+    assert [group.label for group in found] == ["RIS, kl_weight 0.1", "RIS, kl_weight 0.5", "SAC"]
+    assert [group.slug for group in found] == ["ris", "ris-2", "sac"]
+    assert [r.config.seed for r in found[0].runs] == [0, 1]
+    assert len({group.colour for group in found}) == 3
+    assert len({group.marker for group in found}) == 3
+
+
+def test_runs_of_different_length_are_one_group(ris_run):
+    run = read(ris_run)
+    longer = dataclasses.replace(run.config.train, steps=5_000, evaluate_every=7)
+    found = groups([run, with_config(run, seed=1, train=longer)])
+    assert [group.label for group in found] == ["RIS"]
+    assert not found[0].runs[1].finished
+
+
+def test_a_foreign_folder_is_one_line(tmp_path, ris_run):
+    (tmp_path / "other").mkdir()
+    for path in (tmp_path / "other", tmp_path / "missing"):
+        with pytest.raises(ConfigurationError, match=path.name) as error:
+            report([ris_run, path], tmp_path / "out")
+        assert "\n" not in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_table_is_one_line(tmp_path, ris_run, copy_run):
+    damaged = copy_run(ris_run, "damaged")
+    (damaged / "metrics.csv").write_text("step,loss\n1,loss\n")
+    with pytest.raises(ConfigurationError, match=r"metrics\.csv cannot be read") as error:
+        report([damaged], tmp_path / "out")
+    assert "\n" not in str(error.value)
+
+
+def test_no_folder_and_an_unwritable_place_are_errors(tmp_path, ris_run):
+    with pytest.raises(ConfigurationError, match="no run folder"):
+        report([])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigurationError, match="cannot write the report"):
+        report([ris_run], tmp_path / "file" / "out")

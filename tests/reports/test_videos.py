@@ -1,0 +1,82 @@
+"""Videos that a reader can open."""
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from midway.reports import imagination, watch
+from midway.reports.rollouts import record
+from midway.training import api
+from midway.types import ConfigurationError
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_video_can_be_read(ris_run, tmp_path, suffix):
+    file = tmp_path / "videos" / f"hard{suffix}"
+    assert watch(ris_run, file, task="hard", episodes=1, seed=0) == file
+    frames = list(imageio.imiter(file))
+    assert 80 < len(frames) < 200
+    assert all(frame.shape == frames[0].shape for frame in frames)
+    assert np.asarray(frames[0], float).std() > 10
+    assert [f.name for f in file.parent.iterdir()] == [file.name]
+
+
+def test_the_default_place_is_in_the_run_folder(sac_run, copy_run):
+    run = copy_run(sac_run, "run")
+    assert watch(run, None, "uniform", 2, 3) == run / "videos" / "uniform.mp4"
+    assert (run / "videos" / "uniform.mp4").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "episodes", "words"),
+    [
+        ("a.avi", "hard", 1, "a.avi"),
+        ("a.mp4", "easy", 1, "unknown task 'easy'"),
+        ("a.mp4", "hard", 0, "episodes 0"),
+    ],
+)
+def test_bad_requests_are_one_line(ris_run, tmp_path, name, task, episodes, words):
+    with pytest.raises(ConfigurationError, match=words) as error:
+        watch(ris_run, tmp_path / name, task, episodes, 0)
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_place_that_cannot_be_written_is_one_line(ris_run, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigurationError, match="cannot write the video"):
+        watch(ris_run, tmp_path / "file" / "a.mp4", "hard", 1, 0)
+
+
+def test_recordings_are_whole_episodes(ris_run):
+    policy = api.load(ris_run)
+    recordings = record(policy, {"hard": 2, "uniform": 3}, seed=5)
+    assert [recording.task for recording in recordings] == ["hard"] * 2 + ["uniform"] * 3
+    for recording in recordings:
+        assert len(recording.achieved) == recording.length + 1
+        distance = np.linalg.norm(recording.achieved[-1, :2] - recording.goal[:2])
+        assert distance == pytest.approx(recording.final_distance, abs=1e-5)
+        assert recording.success == (distance < 0.5)
+        assert recording.success or recording.length == 150
+    again = record(policy, {"hard": 2, "uniform": 3}, seed=5)
+    np.testing.assert_array_equal(again[4].achieved, recordings[4].achieved)
+
+
+def test_imagined_subgoals_follow_their_distribution(ris_run):
+    policy = api.load(ris_run)
+    pair = np.zeros((1, 4), np.float32), np.ones((1, 4), np.float32)
+    location, scale = imagination.distribution(policy, *pair)
+    drawn = imagination.subgoals(policy, *pair, count=20_000)[0]
+    np.testing.assert_allclose(np.median(drawn, 0), location[0], atol=0.05 * scale.max())
+    np.testing.assert_allclose(np.abs(drawn - location).mean(0), scale[0], rtol=0.05)
+
+
+def test_a_chain_halves_the_way_again_and_again(ris_run):
+    policy = api.load(ris_run)
+    start, goal = np.zeros(4, np.float32), np.ones(4, np.float32)
+    way = imagination.chain(policy, start, goal, 2)
+    assert way.shape == (3, 4)
+    middle = imagination.distribution(policy, start[None], goal[None])[0][0]
+    last = imagination.distribution(policy, middle[None], goal[None])[0][0]
+    np.testing.assert_allclose(way[1], middle, rtol=1e-5)
+    np.testing.assert_allclose(way[2], last, rtol=1e-5)
