@@ -47,6 +47,11 @@ def check(spec, reference, batch):
         assert goal in allowed[kind]
     check_contents(spec, batch, pairs, goals, source == "own")
     check_rewards(spec, batch, following, goals)
+    if spec is VECTOR:
+        assert batch.outcome is None
+    else:
+        assert names(batch.outcome.achieved) == following
+        assert names(batch.outcome.desired) == goals
 
 
 def check_contents(spec, batch, pairs, goals, is_own):
