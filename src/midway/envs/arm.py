@@ -38,7 +38,7 @@ TOLERANCE = 1e-9
 DRAWN = 'contype="0" conaffinity="0" mass="0"'
 """Attributes of a shape that is seen but neither touches nor weighs anything."""
 
-ARM_COLOUR = "0.65 0.1 0.1 0.35"
+ARM_COLOUR = "0.65 0.1 0.1 0.3"
 """Red, and so transparent that the puck shows through the arm."""
 
 HAND_COLOUR = "0.15 0.95 0.15 1"

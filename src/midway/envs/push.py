@@ -11,12 +11,14 @@ from jaxtyping import Float, Float32, Int, Shaped
 
 from midway.envs.arm import Arm
 from midway.envs.push_scene import (
+    CLEARANCE,
     HAND_BOX,
     IMAGE_SIZE,
     PUCK_BOX,
+    ROUNDING,
     TABLE,
     TASKS,
-    clear,
+    possible,
     push_model,
 )
 from midway.envs.rendering import backend, draw
@@ -32,9 +34,6 @@ ACTION_SCALE = 0.02
 
 GOAL_THRESHOLD = 0.05
 """Distance in x-y below which hand and puck have to be (m); paper, appendix C."""
-
-ROUNDING = 1e-6
-"""More than float32 rounding can take from a distance on the table (m)."""
 
 STATE_BOX = spaces.Box(
     np.array(TABLE.low * 2, np.float32), np.array(TABLE.high * 2, np.float32), dtype=np.float32
@@ -174,11 +173,10 @@ class PushStateVectorEnv(SimulationVectorEnv):
             raise ConfigurationError(
                 f"{role} {states!r}: must be hand x, y and puck x, y, or these for each copy"
             ) from None
-        hand, puck = states[:, :2], states[:, 2:]
-        if not (HAND_BOX.contains(hand) & PUCK_BOX.contains(puck) & clear(states)).all():
+        for state in states[~possible(states)]:
             raise ConfigurationError(
-                f"{role} {states.tolist()}: must have the hand in {HAND_BOX}, the puck in "
-                f"{PUCK_BOX} and both apart"
+                f"{role} {state.tolist()}: the hand must be in {HAND_BOX}, the puck in {PUCK_BOX} "
+                f"and {CLEARANCE} m from it"
             )
         return list(states)
 

@@ -39,6 +39,9 @@ PUCK_HEIGHT = 0.017
 CLEARANCE = 0.055
 """Least distance of hand and puck in a start or goal: the radii of puck and fingers."""
 
+ROUNDING = 1e-6
+"""More than float32 rounding can take from a length on the table (m)."""
+
 MAX_DRAWS = 1000
 """Rounds of random draws before giving up."""
 
@@ -182,16 +185,19 @@ def _sample_state(
     for _ in range(MAX_DRAWS):
         low, high = (*hand.low, *puck.low), (*hand.high, *puck.high)
         states = rng.uniform(low, high, (POINTS_PER_DRAW, 4))
-        allowed = clear(states) & (np.linalg.norm(states[:, 2:] - states[:, :2], axis=1) <= within)
+        apart = np.linalg.norm(states[:, 2:] - states[:, :2], axis=1)
+        allowed = (apart >= CLEARANCE) & (apart <= within)
         if allowed.any():
             return np.asarray(states[allowed.argmax()])
     raise ConfigurationError(f"push: hand in {hand} always too near to a puck in {puck}")
 
 
-def clear(states: Float[np.ndarray, "*batch 4"]) -> Bool[np.ndarray, "*batch"]:
-    """Return whether the hand is clear of the puck."""
-    apart = np.linalg.norm(states[..., 2:] - states[..., :2], axis=-1)
-    return np.asarray(apart >= CLEARANCE)
+def possible(states: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
+    """Return whether hand and puck can be placed so, but for rounding."""
+    hand, puck = states[:, :2], states[:, 2:]
+    clear = np.linalg.norm(puck - hand, axis=1) >= CLEARANCE - ROUNDING
+    in_place = HAND_BOX.grown(ROUNDING).contains(hand) & PUCK_BOX.grown(ROUNDING).contains(puck)
+    return np.asarray(clear & in_place)
 
 
 TASKS: Mapping[str, PushTask] = MappingProxyType(
