@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.live import Live
 
 from midway.cluster import sweep
-from midway.cluster.sweep import Job
+from midway.cluster.jobs import Job
 
 RESULTS = Path(__file__).parent / "results"
 KEPT = ("evaluation.csv", "metrics.csv", "config.json")

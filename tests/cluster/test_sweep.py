@@ -6,6 +6,7 @@ import pytest
 
 from midway.cli.main import main
 from midway.cluster import sweep
+from midway.cluster.jobs import Job
 from midway.training.folder import RunFolder
 from midway.types import ConfigurationError
 
@@ -19,7 +20,7 @@ def test_jobs_are_every_combination_with_names_of_their_own() -> None:
     assert len(set(names)) == 8
     assert names[0] == "point-u-ris-seed0"
     assert all("/" not in name for name in names)
-    assert sweep.Job("point-u", "ris", 0, label="f32").name == "point-u-ris-f32-seed0"
+    assert Job("point-u", "ris", 0, label="f32").name == "point-u-ris-f32-seed0"
 
 
 def test_sweep_runs_everything_and_is_quick_the_second_time(

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from midway.cluster.sweep import Job, State, execute, finished
+from midway.cluster.jobs import Job, State, execute, finished
 from midway.types import ConfigurationError
 
 RETRIES = 20

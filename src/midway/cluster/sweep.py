@@ -4,58 +4,19 @@ Each run is a run folder below the sweep's folder. A sweep that is started again
 finished and resumes what was interrupted.
 """
 
-import csv
 import os
 import queue
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
+from midway.cluster import on_ray
+from midway.cluster.jobs import POLL_SECONDS, Job, State, execute, finished, last_success
 from midway.training.folder import RunFolder
 from midway.types import ConfigurationError
-
-State: TypeAlias = Literal["waiting", "running", "finished", "failed"]
-
-POLL_SECONDS = 1.0
-RELEASE_SECONDS = 120.0
-
-
-@dataclass(frozen=True)
-class Job:
-    """One run of a sweep.
-
-    Attributes:
-        env: Environment name.
-        agent: Agent name.
-        seed: Its seed.
-        options: Further options of ``midway train``.
-        label: Tells runs apart that differ in their options alone.
-    """
-
-    env: str
-    agent: str
-    seed: int
-    options: tuple[str, ...] = ()
-    label: str = ""
-
-    @property
-    def name(self) -> str:
-        """Name of its run folder."""
-        parts = (self.env.replace("/", "-"), self.agent, self.label, f"seed{self.seed}")
-        return "-".join(part for part in parts if part)
-
-    def command(self, folder: Path) -> list[str]:
-        """Return the command that starts the run, or continues it where there is one."""
-        midway = [sys.executable, "-m", "midway.cli"]
-        if RunFolder(folder).config_file.exists():
-            return [*midway, "resume", str(folder)]
-        arguments = ["--agent", self.agent, "--seed", str(self.seed), "--out", str(folder)]
-        return [*midway, "train", self.env, *arguments, *self.options]
 
 
 @dataclass(frozen=True)
@@ -73,10 +34,6 @@ class Status:
     state: State
     step: int | None
     success: float | None
-
-
-Execute: TypeAlias = Callable[[Job, Path], bool]
-"""Runs a job in its folder, to its end; returns whether it is finished."""
 
 
 def jobs(
@@ -112,8 +69,6 @@ def run(
     if ray_address is None:
         workers = _local_workers(wanted, folder, states)
     else:
-        from midway.cluster import on_ray
-
         workers = on_ray.start(wanted, folder, states, ray_address)
     for worker in workers:
         worker.start()
@@ -132,49 +87,6 @@ def statuses(folder: Path, states: dict[Job, State]) -> list[Status]:
         step, success = last_success(RunFolder(folder / job.name).evaluation_file)
         found.append(Status(job, state, step, success))
     return found
-
-
-def last_success(evaluation: Path) -> tuple[int | None, float | None]:
-    """Return step and success of the last evaluation: mean actions, ``hard`` if it is there."""
-    try:
-        with evaluation.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row.get("actions") == "mean"]
-        last = [row for row in rows if row["step"] == rows[-1]["step"]]
-        row = next((row for row in last if row["task"] == "hard"), last[0])
-        return int(row["step"]), float(row["success_rate"])
-    except (OSError, IndexError, TypeError, ValueError):
-        return None, None
-
-
-def finished(job: Job, folder: Path) -> bool:
-    """Return whether the run has taken all its steps."""
-    run_folder = RunFolder(folder / job.name)
-    if not run_folder.config_file.exists():
-        return False
-    step, _ = last_success(run_folder.evaluation_file)
-    return step is not None and step >= run_folder.load_config().train.steps
-
-
-def execute(job: Job, folder: Path, core: int | None = None) -> bool:
-    """Run a job in a process of its own, on one core if given; return whether it is finished.
-
-    The process dies with its parent: a machine's or worker's end must not leave a second writer.
-    """
-    _wait_until_free(RunFolder(folder / job.name))
-    command = ["setpriv", "--pdeathsig", "KILL", *job.command(folder / job.name)]
-    if core is not None:
-        command = ["taskset", "-c", str(core), *command]
-    with (folder / f"{job.name}.log").open("a") as log:
-        subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False)
-    return finished(job, folder)
-
-
-def _wait_until_free(run_folder: RunFolder) -> None:
-    """Wait for a process that has lost its worker, and is about to die, to let go of the run."""
-    for _ in range(int(RELEASE_SECONDS / POLL_SECONDS)):
-        if not run_folder.in_use():
-            return
-        time.sleep(POLL_SECONDS)
 
 
 def _local_workers(

@@ -1,0 +1,92 @@
+"""One run of a sweep: its command, its folder, and how far it is."""
+
+import csv
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from midway.training.folder import RunFolder
+
+State: TypeAlias = Literal["waiting", "running", "finished", "failed"]
+
+POLL_SECONDS = 1.0
+RELEASE_SECONDS = 120.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a sweep.
+
+    Attributes:
+        env: Environment name.
+        agent: Agent name.
+        seed: Its seed.
+        options: Further options of ``midway train``.
+        label: Tells runs apart that differ in their options alone.
+    """
+
+    env: str
+    agent: str
+    seed: int
+    options: tuple[str, ...] = ()
+    label: str = ""
+
+    @property
+    def name(self) -> str:
+        """Name of its run folder."""
+        parts = (self.env.replace("/", "-"), self.agent, self.label, f"seed{self.seed}")
+        return "-".join(part for part in parts if part)
+
+    def command(self, folder: Path) -> list[str]:
+        """Return the command that starts the run, or continues it where there is one."""
+        midway = [sys.executable, "-m", "midway.cli"]
+        if RunFolder(folder).config_file.exists():
+            return [*midway, "resume", str(folder)]
+        arguments = ["--agent", self.agent, "--seed", str(self.seed), "--out", str(folder)]
+        return [*midway, "train", self.env, *arguments, *self.options]
+
+
+def execute(job: Job, folder: Path, core: int | None = None) -> bool:
+    """Run a job in a process of its own, on one core if given; return whether it is finished.
+
+    The process dies with its parent: a machine's or worker's end must not leave a second writer.
+    """
+    _wait_until_free(RunFolder(folder / job.name))
+    command = ["setpriv", "--pdeathsig", "KILL", *job.command(folder / job.name)]
+    if core is not None:
+        command = ["taskset", "-c", str(core), *command]
+    with (folder / f"{job.name}.log").open("a") as log:
+        subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False)
+    return finished(job, folder)
+
+
+def _wait_until_free(run_folder: RunFolder) -> None:
+    """Wait for a process that has lost its worker, and is about to die, to let go of the run."""
+    for _ in range(int(RELEASE_SECONDS / POLL_SECONDS)):
+        if not run_folder.in_use():
+            return
+        time.sleep(POLL_SECONDS)
+
+
+def finished(job: Job, folder: Path) -> bool:
+    """Return whether the run has taken all its steps."""
+    run_folder = RunFolder(folder / job.name)
+    if not run_folder.config_file.exists():
+        return False
+    step, _ = last_success(run_folder.evaluation_file)
+    return step is not None and step >= run_folder.load_config().train.steps
+
+
+def last_success(evaluation: Path) -> tuple[int | None, float | None]:
+    """Return step and success of the last evaluation: mean actions, ``hard`` if it is there."""
+    try:
+        with evaluation.open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row.get("actions") == "mean"]
+        last = [row for row in rows if row["step"] == rows[-1]["step"]]
+        row = next((row for row in last if row["task"] == "hard"), last[0])
+        return int(row["step"]), float(row["success_rate"])
+    except (OSError, IndexError, TypeError, ValueError):
+        return None, None
