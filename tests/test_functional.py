@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from midway import functional
 
 BATCH = 6
-quick = settings(max_examples=40, deadline=None)
+quick = settings(max_examples=25, deadline=None)
 
 
 def floats(shape: tuple[int, ...], low: float, high: float) -> st.SearchStrategy[np.ndarray]:

@@ -64,7 +64,8 @@ def state(golden: dict[str, np.ndarray]) -> ris.State:
         epsilon=float(epsilon),
         num_subgoals=int(num_subgoals),
     )
-    state = eqx.filter_jit(ris.create)(config, SPEC, jax.random.key(0))
+    shapes = eqx.filter_eval_shape(ris.create, config, SPEC, jax.random.key(0))
+    state = jax.tree.map(lambda x: jnp.asarray(np.zeros(x.shape, x.dtype)), shapes)
     networks = [
         ("policy", state.policy.network, POLICY),
         ("prior_policy", state.prior_policy.network, POLICY),
