@@ -51,11 +51,3 @@ def copy_run(tmp_path: Path) -> Callable[..., Path]:
         return folder
 
     return copy
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say at the end which tests of this folder were not run, and why."""
-    for report in terminalreporter.stats.get("skipped", []):
-        if "tests/reports/" in report.nodeid:
-            reason = str(report.longrepr[-1]).removeprefix("Skipped: ")
-            terminalreporter.write_line(f"NOT RUN: {report.nodeid}: {reason}", yellow=True)

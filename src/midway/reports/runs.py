@@ -14,7 +14,7 @@ from midway.reports import style
 from midway.training.folder import RunConfig, RunFolder, read_json
 from midway.types import ConfigurationError
 
-Table: TypeAlias = dict[str, np.ndarray[Any, Any]]
+Table: TypeAlias = dict[str, np.ndarray[Any, np.dtype[Any]]]
 """Columns by name: float64, or text for the columns of ``TEXT_COLUMNS``."""
 
 Row: TypeAlias = dict[str, float]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import imageio_ffmpeg
 import numpy as np
@@ -40,6 +40,7 @@ SUBGOALS = 20
 GIF_COLOURS = 64
 
 
+@runtime_checkable
 class Scene(Protocol):
     """Draws the frames of one episode; all frames of a video have the same size."""
 
