@@ -221,7 +221,7 @@ class Pretraining:
     Attributes:
         networks: Parts of the agent's state that this trains; they are saved and can be reused.
         states: Number of states.
-        random_actions: Actions taken after each reset; the state after each of them is used.
+        random_actions: Actions taken after each reset; the states before and after each are used.
         rounds: Calls of ``pretrain``.
         source: Run folder whose networks are taken instead, or nothing.
     """

@@ -2,10 +2,10 @@
 
 from types import ModuleType
 
-from midway.agents import ris, sac
+from midway.agents import leap, ris, sac, tdm
 from midway.types import ConfigurationError
 
-AGENTS: dict[str, ModuleType] = {"ris": ris, "sac": sac}
+AGENTS: dict[str, ModuleType] = {"ris": ris, "sac": sac, "tdm": tdm, "leap": leap}
 """Each module is a `midway.types.Agent` with its ``Config``, ``State`` and ``NETWORKS``."""
 
 

@@ -1,0 +1,349 @@
+"""TDM: temporal difference models, goal-conditioned Q functions of a finite horizon, on TD3.
+
+Pong et al. (2018), as LEAP trains them (Nasiriany et al. 2019; appendix D and table 2). Q(s, a, g,
+n) predicts how far from the goal each number of the state will be when n steps are left after this
+one: a vector, minus the absolute differences. One update does, in this order: critics, and every
+second time policy and Polyak copies. Each step uses the networks that the one before has updated.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, Key, Shaped
+
+from midway import functional
+from midway.networks import encoder as encoders
+from midway.networks import optimizer
+from midway.networks.encoder import StateEncoder
+from midway.networks.initialization import with_small_output
+from midway.networks.mlp import MLP, Precision
+from midway.types import Batch, ConfigurationError, EnvSpec, Metrics
+
+OUTPUT_BOUND = 3e-3
+"""Output weights start uniform in ± this (original code)."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Hyperparameters of TDM; the defaults are those of the ant (appendix D, original code).
+
+    Attributes:
+        hidden: Hidden layers of every network.
+        max_steps_left: The horizon: steps_left is drawn from 0 to this, included (table 2).
+        num_rewards: Length of the reward vector, the first numbers of what success is measured on
+            (positions, not velocities); 0: all.
+        reward_scale: Factor of the reward.
+        target_update_rate: τ, of the target networks.
+        policy_delay: Updates of the critics for each update of policy and target networks.
+        critic_learning_rate: Adam's rate for the critics.
+        policy_learning_rate: Adam's rate for the policy.
+        encoder_learning_rate: Adam's rate for the image encoder.
+        target_noise: Standard deviation of the noise on target actions.
+        target_noise_bound: Bound of that noise.
+        saturation_weight: Weight of the cost of actions far in the tails of tanh.
+        saturation_bound: Absolute value before the tanh from which that cost is positive.
+        exploration_noise: Standard deviation of the steps of the Ornstein-Uhlenbeck process.
+        exploration_reversion: Share of that process's value that is lost in each step.
+        precision: Products in ``f32`` or ``bf16``; everything else is float32.
+    """
+
+    hidden: tuple[int, ...] = (400, 300)
+    max_steps_left: int = 50
+    num_rewards: int = 0
+    reward_scale: float = 10.0
+    target_update_rate: float = 0.005
+    policy_delay: int = 2
+    critic_learning_rate: float = 1e-3
+    policy_learning_rate: float = 1e-3
+    encoder_learning_rate: float = 1e-4
+    target_noise: float = 0.2
+    target_noise_bound: float = 0.5
+    saturation_weight: float = 1.0
+    saturation_bound: float = 20.0
+    exploration_noise: float = 0.3
+    exploration_reversion: float = 0.15
+    precision: Precision = "f32"
+
+
+class State(eqx.Module):
+    """Networks, their Polyak copies, their optimisers and the number of updates."""
+
+    encoder: StateEncoder
+    critic: tuple[MLP, MLP]
+    target_critic: tuple[MLP, MLP]
+    policy: MLP
+    target_policy: MLP
+    encoder_optimizer: optax.OptState
+    critic_optimizer: optax.OptState
+    policy_optimizer: optax.OptState
+    updates: Int[Array, ""]
+    config: Config = eqx.field(static=True)
+    spec: EnvSpec = eqx.field(static=True)
+
+
+AnyState = TypeVar("AnyState", bound=State)
+
+NETWORKS = ("encoder", "critic", "target_critic", "policy", "target_policy")
+"""The parts of the state that a saved policy holds."""
+
+
+class Memory(NamedTuple):
+    """What is remembered of an episode.
+
+    Attributes:
+        steps_left: Steps left after the next one.
+        noise: State of the exploration noise.
+    """
+
+    steps_left: Int[Array, " B"]
+    noise: Float[Array, "B A"]
+
+
+# --- losses ---------------------------------------------------------------------------------------
+
+
+def reward_vector(config: Config, batch: Batch) -> Float[Array, "B R"]:
+    """Return minus the scaled absolute differences of what was achieved to what is desired."""
+    achieved, desired = batch.outcome or (batch.next_observation, batch.goal)
+    difference = jnp.abs(achieved - desired)[:, : config.num_rewards or None]
+    return -config.reward_scale * difference
+
+
+def q_values(critic: tuple[MLP, MLP], *inputs: Float[Array, "B _"]) -> Float[Array, "2 B R"]:
+    """Return the Q vectors of both critics at (s, a, g, n)."""
+    return jnp.stack([network(*inputs) for network in critic])
+
+
+def critic_target(
+    state: State,
+    batch: Batch,
+    reward: Float[Array, "B R"],
+    steps_left: Float[Array, "B 1"],
+    noise: Float[Array, "B A"],
+) -> Float[Array, "B R"]:
+    """Return r where no step is left, else min Q'(s', π'(s', g, n - 1) + noise, g, n - 1).
+
+    The minimum is taken for each number of the vector; there is no discount. The sum of action and
+    clipped noise is not clipped again (original code).
+    """
+    bound = state.config.target_noise_bound
+    pre_tanh = state.target_policy(batch.next_observation, batch.goal, steps_left - 1)
+    action = jnp.tanh(pre_tanh) + jnp.clip(state.config.target_noise * noise, -bound, bound)
+    inputs = (batch.next_observation, action, batch.goal, steps_left - 1)
+    return jnp.where(steps_left == 0, reward, q_values(state.target_critic, *inputs).min(0))
+
+
+def critic_loss(
+    networks: tuple[tuple[MLP, MLP], StateEncoder],
+    observation: Shaped[Array, "B ..."],
+    batch: Batch,
+    steps_left: Float[Array, "B 1"],
+    target: Float[Array, "B R"],
+) -> tuple[Float[Array, ""], tuple[Float[Array, "B S"], Metrics]]:
+    """Return both critics' mean squared errors, and the codes of the current observations."""
+    critic, encoder = networks
+    code = encoder(observation)
+    q = q_values(critic, code, batch.action, batch.goal, steps_left)
+    loss = ((q - target) ** 2).mean((1, 2)).sum()
+    return loss, (code, {"critic/loss": loss, "critic/q": q.mean(), "critic/target": target.mean()})
+
+
+def policy_loss(
+    policy: MLP, state: State, batch: Batch, steps_left: Float[Array, "B 1"]
+) -> tuple[Float[Array, ""], Metrics]:
+    """Return minus the mean of critic 1's vector, plus the cost of saturated actions."""
+    pre_tanh = policy(batch.observation, batch.goal, steps_left)
+    q = state.critic[0](batch.observation, jnp.tanh(pre_tanh), batch.goal, steps_left)
+    saturation = jax.nn.relu(jnp.abs(pre_tanh) - state.config.saturation_bound).mean()
+    loss = -q.mean() + state.config.saturation_weight * saturation
+    return loss, {"policy/loss": loss, "policy/saturation": saturation}
+
+
+def value(
+    state: State,
+    observation: Float[Array, "B S"],
+    goal: Float[Array, "B G"],
+    steps_left: Float[Array, "B 1"] | None = None,
+) -> Float[Array, " B"]:
+    """Return V(s, g, n): minus the L2 distance that critic 1 predicts for the policy's action.
+
+    Where ``steps_left`` is not given, it is the whole horizon.
+    """
+    if steps_left is None:
+        steps_left = jnp.full((len(observation), 1), float(state.config.max_steps_left))
+    action = jnp.tanh(state.policy(observation, goal, steps_left))
+    q = state.critic[0](observation, action, goal, steps_left)
+    distance: Float[Array, " B"] = jnp.linalg.norm(q / state.config.reward_scale, axis=-1)
+    return -distance
+
+
+# --- update ---------------------------------------------------------------------------------------
+
+
+def update(state: AnyState, batch: Batch, key: Key[Array, ""]) -> tuple[AnyState, Metrics]:
+    """Return the state after one gradient step, and scalars to log.
+
+    Scalars of the policy are multiplied by ``policy_delay`` where it was updated and 0 elsewhere,
+    so that means over many updates are means over those of the policy.
+    """
+    encoding_key, steps_key, noise_key = jax.random.split(key, 3)
+    reward = reward_vector(state.config, batch)
+    observation, batch = encode(state, batch, encoding_key)
+    steps_left = draw_steps_left(state.config, len(batch.action), steps_key)
+    noise = jax.random.normal(noise_key, batch.action.shape)
+    target = critic_target(state, batch, reward, steps_left, noise)
+    state, code, metrics = update_critic(state, observation, batch, steps_left, target)
+    nothing = {"policy/loss": jnp.zeros(()), "policy/saturation": jnp.zeros(())}
+    state, policy_metrics = jax.lax.cond(
+        state.updates % state.config.policy_delay == 0,
+        update_policy_and_copies,
+        lambda state, *_: (state, nothing),
+        *(state, batch._replace(observation=code), steps_left),
+    )
+    return replace(state, updates=state.updates + 1), metrics | policy_metrics
+
+
+def draw_steps_left(config: Config, count: int, key: Key[Array, ""]) -> Float[Array, "B 1"]:
+    """Return numbers of steps left, uniform from 0 to the horizon, both included."""
+    return jax.random.randint(key, (count, 1), 0, config.max_steps_left + 1).astype(jnp.float32)
+
+
+def encode(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[Shaped[Array, "B ..."], Batch]:
+    """Return the augmented observation, and the batch with next observation and goal as codes."""
+    keys = jax.random.split(key, 3)
+    encoder = state.encoder
+
+    def code(image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Float[Array, "B S"]:
+        return jax.lax.stop_gradient(encoder(encoder.augment(image, key)))
+
+    fixed = batch._replace(
+        next_observation=code(batch.next_observation, keys[1]), goal=code(batch.goal, keys[2])
+    )
+    return encoder.augment(batch.observation, keys[0]), fixed
+
+
+def update_critic(
+    state: AnyState,
+    observation: Shaped[Array, "B ..."],
+    batch: Batch,
+    steps_left: Float[Array, "B 1"],
+    target: Float[Array, "B R"],
+) -> tuple[AnyState, Float[Array, "B S"], Metrics]:
+    """Step the critics and the encoder; also return the codes of the current observations."""
+    gradient_of = eqx.filter_value_and_grad(critic_loss, has_aux=True)
+    (_, (code, metrics)), (critic_gradient, encoder_gradient) = gradient_of(
+        (state.critic, state.encoder), observation, batch, steps_left, target
+    )
+    critic, critic_optimizer = optimizer.step(
+        state.critic, critic_gradient, state.critic_optimizer, state.config.critic_learning_rate
+    )
+    encoder, encoder_optimizer = optimizer.step(
+        state.encoder, encoder_gradient, state.encoder_optimizer, state.config.encoder_learning_rate
+    )
+    state = replace(state, critic=critic, critic_optimizer=critic_optimizer)
+    state = replace(state, encoder=encoder, encoder_optimizer=encoder_optimizer)
+    return state, jax.lax.stop_gradient(code), metrics
+
+
+def update_policy_and_copies(
+    state: AnyState, batch: Batch, steps_left: Float[Array, "B 1"]
+) -> tuple[AnyState, Metrics]:
+    """Step the policy against critic 1 and move all target networks by τ."""
+    gradient_of = eqx.filter_value_and_grad(policy_loss, has_aux=True)
+    (_, metrics), gradient = gradient_of(state.policy, state, batch, steps_left)
+    policy, policy_optimizer = optimizer.step(
+        state.policy, gradient, state.policy_optimizer, state.config.policy_learning_rate
+    )
+    rate = state.config.target_update_rate
+    state = replace(
+        state,
+        policy=policy,
+        policy_optimizer=policy_optimizer,
+        target_policy=functional.polyak_update(policy, state.target_policy, rate),
+        target_critic=functional.polyak_update(state.critic, state.target_critic, rate),
+    )
+    return state, {name: state.config.policy_delay * value for name, value in metrics.items()}
+
+
+# --- act and create -------------------------------------------------------------------------------
+
+
+def begin(config: Config, spec: EnvSpec, num_episodes: int) -> Memory:
+    """Return what is remembered before the first step: the whole horizon is left, no noise yet."""
+    steps_left = jnp.full(num_episodes, config.max_steps_left)
+    return Memory(steps_left, jnp.zeros((num_episodes, spec.action_dim)))
+
+
+def act_on(
+    state: State,
+    memory: Memory,
+    observation: Shaped[Array, "B ..."],
+    goal: Shaped[Array, "B ..."],
+    key: Key[Array, ""],
+    explore: bool,
+) -> tuple[Float[Array, "B A"], Memory]:
+    """Return actions, and steps_left counted down from the horizon to 0, again and again.
+
+    Where ``explore``, Ornstein-Uhlenbeck noise is added.
+    """
+    steps_left = memory.steps_left[:, None].astype(jnp.float32)
+    action = jnp.tanh(state.policy(state.encoder(observation), state.encoder(goal), steps_left))
+    noise = memory.noise
+    if explore:
+        kept = (1 - state.config.exploration_reversion) * noise
+        noise = kept + state.config.exploration_noise * jax.random.normal(key, noise.shape)
+        action = jnp.clip(action + noise, -1, 1)
+    again = state.config.max_steps_left
+    return action, Memory(jnp.where(memory.steps_left == 0, again, memory.steps_left - 1), noise)
+
+
+def act(
+    state: State,
+    observation: Shaped[Array, "B ..."],
+    goal: Shaped[Array, "B ..."],
+    key: Key[Array, ""],
+    explore: bool,
+) -> Float[Array, "B A"]:
+    """Return actions in [-1, 1] with the whole horizon left; with noise where ``explore``."""
+    memory = begin(state.config, state.spec, len(observation))
+    return act_on(state, memory, observation, goal, key, explore)[0]
+
+
+def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
+    """Return networks at their random start; the copies equal their originals.
+
+    Raises:
+        ConfigurationError: The goals are images and there is no true state to take rewards from.
+    """
+    if spec.is_image and spec.state_shape is None:
+        raise ConfigurationError(f"{spec.name}: rewards of tdm need goals or states of numbers")
+    encoder_key, first_key, second_key, policy_key = jax.random.split(key, 4)
+    num_rewards = config.num_rewards or (spec.state_shape or spec.goal_shape)[0]
+    inputs = sum(encoders.code_sizes(spec)) + 1
+
+    def network(in_size: int, out_size: int, key: Key[Array, ""]) -> MLP:
+        new = MLP(in_size, config.hidden, out_size, config.precision, key=key)
+        return with_small_output(new, OUTPUT_BOUND)
+
+    encoder = encoders.create(spec, encoder_key)
+    critic_inputs = inputs + spec.action_dim
+    first, second = (network(critic_inputs, num_rewards, k) for k in (first_key, second_key))
+    critic = (first, second)
+    policy = network(inputs, spec.action_dim, policy_key)
+    return State(
+        encoder=encoder,
+        critic=critic,
+        target_critic=functional.copy(critic),
+        policy=policy,
+        target_policy=functional.copy(policy),
+        encoder_optimizer=optimizer.init(encoder),
+        critic_optimizer=optimizer.init(critic),
+        policy_optimizer=optimizer.init(policy),
+        updates=jnp.zeros((), jnp.int32),
+        config=config,
+        spec=spec,
+    )

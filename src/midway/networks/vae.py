@@ -1,0 +1,215 @@
+"""Variational autoencoders of states and of images, in whose latent numbers LEAP plans.
+
+Sizes are those of appendix D; losses those of the original LEAP implementation.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, Shaped
+
+from midway.networks.initialization import with_small_output
+from midway.networks.mlp import MLP, Linear
+from midway.types import EnvSpec, Metrics
+
+SMALLEST_DEVIATION = 1e-3
+"""Entries of a state that vary less than this are centred, but not scaled (original code)."""
+
+SMALLEST_LOG_VARIANCE = float(jnp.log(1e-4))
+"""Bound of the image encoder's log-variance (original code)."""
+
+IMAGE_SIZE = 84
+ENCODER_LAYERS = ((5, 3, 16), (5, 3, 16), (5, 3, 32))
+"""Kernel, stride and output channels: 84 -> 27 -> 8 -> 2 pixels (appendix D)."""
+DECODER_LAYERS = ((5, 3, 32), (6, 3, 16), (6, 3, 3))
+"""The same for 2 -> 8 -> 27 -> 84 pixels; the appendix lists the input channels 32, 32, 16."""
+SMALLEST_MAP = (2, 2, 32)
+
+
+class Latent(NamedTuple):
+    """A diagonal Gaussian over the latent numbers, q(z | x)."""
+
+    mean: Float[Array, "*B L"]
+    log_variance: Float[Array, "*B L"]
+
+    def sample(self, noise: Float[Array, "*B L"]) -> Float[Array, "*B L"]:
+        """Return mean + standard deviation * noise."""
+        return self.mean + jnp.exp(0.5 * self.log_variance) * noise
+
+    def kl(self) -> Float[Array, "*B"]:
+        """Return D_KL(q(z | x) || N(0, 1)), summed over the latent numbers."""
+        variance = jnp.exp(self.log_variance)
+        return 0.5 * (self.mean**2 + variance - 1 - self.log_variance).sum(-1)
+
+
+class StateVAE(eqx.Module):
+    """Autoencoder of states ``(S,)``, which it standardises by ``center`` and ``scale``."""
+
+    encoder: MLP
+    decoder: MLP
+    center: Float[Array, " S"]
+    scale: Float[Array, " S"]
+
+    def __init__(
+        self, state_size: int, latent_size: int, hidden: tuple[int, ...], *, key: Key[Array, ""]
+    ) -> None:
+        encoder_key, decoder_key = jax.random.split(key)
+        encoder = MLP(state_size, hidden, 2 * latent_size, "f32", key=encoder_key)
+        decoder = MLP(latent_size, hidden[::-1], state_size, "f32", key=decoder_key)
+        self.encoder = with_small_output(encoder, 1e-3)
+        self.decoder = with_small_output(decoder, 1e-3)
+        self.center = jnp.zeros(state_size)
+        self.scale = jnp.ones(state_size)
+
+    def encode(self, state: Float[Array, "*B S"]) -> Latent:
+        """Return the distribution of the states' latent numbers."""
+        center, scale = jax.lax.stop_gradient((self.center, self.scale))
+        mean, log_variance = jnp.split(self.encoder((state - center) / scale), 2, axis=-1)
+        return Latent(mean, log_variance)
+
+    def decode(self, latent: Float[Array, "*B L"]) -> Float[Array, "*B S"]:
+        """Return the states that the latent numbers stand for, in their own units."""
+        center, scale = jax.lax.stop_gradient((self.center, self.scale))
+        state: Float[Array, "*B S"] = self.decoder(latent) * scale + center
+        return state
+
+    def error(
+        self, state: Float[Array, "B S"], reconstruction: Float[Array, "B S"]
+    ) -> Float[Array, " B"]:
+        """Return the mean squared error over the standardised entries."""
+        scale = jax.lax.stop_gradient(self.scale)
+        return (((state - reconstruction) / scale) ** 2).mean(-1)
+
+    def standardised(self, states: Float[Array, "N S"]) -> "StateVAE":
+        """Return the autoencoder with mean and deviation of these states."""
+        deviation = states.std(0)
+        scale = jnp.where(deviation < SMALLEST_DEVIATION, 1.0, deviation)
+        parts = (states.mean(0), scale)
+        vae: StateVAE = eqx.tree_at(lambda v: (v.center, v.scale), self, parts)
+        return vae
+
+
+class Convolution(eqx.Module):
+    """Convolution without padding, or its transpose; images are ``(B, height, width, C)``."""
+
+    weight: Float[Array, "K K I O"]
+    bias: Float[Array, " O"]
+    stride: int = eqx.field(static=True)
+    transposed: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        kernel: int,
+        stride: int,
+        channels: tuple[int, int],
+        transposed: bool = False,
+        *,
+        key: Key[Array, ""],
+    ) -> None:
+        # Uniform in ±1/√(number of inputs of one output), like `Linear`.
+        bound = (channels[0] * kernel**2) ** -0.5
+        weight_key, bias_key = jax.random.split(key)
+        shape = (kernel, kernel, *channels)
+        self.weight = jax.random.uniform(weight_key, shape, minval=-bound, maxval=bound)
+        self.bias = jax.random.uniform(bias_key, channels[1:], minval=-bound, maxval=bound)
+        self.stride = stride
+        self.transposed = transposed
+
+    def __call__(self, image: Float[Array, "B H W I"]) -> Float[Array, "B H2 W2 O"]:
+        """Return the filtered image."""
+        strides, layout = (self.stride, self.stride), ("NHWC", "HWIO", "NHWC")
+        if self.transposed:
+            filtered = jax.lax.conv_transpose(image, self.weight, strides, "VALID", None, layout)
+        else:
+            filtered = jax.lax.conv_general_dilated(
+                image, self.weight, strides, "VALID", dimension_numbers=layout
+            )
+        return filtered + self.bias
+
+
+class ImageVAE(eqx.Module):
+    """Autoencoder of images ``(84, 84, 3)``; reconstructions have values around [0, 1]."""
+
+    convolutions: tuple[Convolution, ...]
+    to_latent: Linear
+    from_latent: Linear
+    deconvolutions: tuple[Convolution, ...]
+
+    def __init__(self, latent_size: int, *, key: Key[Array, ""]) -> None:
+        keys = iter(jax.random.split(key, 8))
+        height, width, deepest = SMALLEST_MAP
+        self.convolutions = _stack(3, ENCODER_LAYERS, False, next(keys))
+        self.to_latent = Linear(height * width * deepest, 2 * latent_size, "f32", key=next(keys))
+        self.from_latent = Linear(latent_size, height * width * deepest, "f32", key=next(keys))
+        self.deconvolutions = _stack(deepest, DECODER_LAYERS, True, next(keys))
+
+    def encode(self, image: Shaped[Array, "B 84 84 3"]) -> Latent:
+        """Return the distribution of the latent numbers of images, uint8 or in [0, 1]."""
+        x = image / 255.0 if image.dtype == jnp.uint8 else image
+        for convolution in self.convolutions:
+            x = jax.nn.relu(convolution(x))
+        mean, raw = jnp.split(self.to_latent(x.reshape(len(x), -1)), 2, axis=-1)
+        return Latent(mean, SMALLEST_LOG_VARIANCE + jnp.abs(raw))
+
+    def decode(self, latent: Float[Array, "B L"]) -> Float[Array, "B 84 84 3"]:
+        """Return the images that the latent numbers stand for."""
+        x = self.from_latent(latent).reshape(-1, *SMALLEST_MAP)
+        for deconvolution in self.deconvolutions:
+            x = deconvolution(jax.nn.relu(x))
+        return x
+
+    def error(
+        self, image: Shaped[Array, "B 84 84 3"], reconstruction: Float[Array, "B 84 84 3"]
+    ) -> Float[Array, " B"]:
+        """Return the squared error summed over the pixels, whose values are in [0, 1]."""
+        return ((image / 255.0 - reconstruction) ** 2).sum((1, 2, 3))
+
+    def standardised(self, states: Shaped[Array, "N 84 84 3"]) -> "ImageVAE":
+        """Return the autoencoder: images are not standardised."""
+        return self
+
+
+def create(
+    spec: EnvSpec, latent_size: int, hidden: tuple[int, ...], key: Key[Array, ""]
+) -> StateVAE | ImageVAE:
+    """Return the autoencoder that suits what a subgoal of the environment is.
+
+    Where goals are not observations, a subgoal is both, and its state is their concatenation.
+    """
+    if spec.is_image:
+        return ImageVAE(latent_size, key=key)
+    size = spec.observation_shape[0] + (0 if spec.goal_is_observation else spec.goal_shape[0])
+    return StateVAE(size, latent_size, hidden, key=key)
+
+
+def loss(
+    vae: StateVAE | ImageVAE,
+    states: Shaped[Array, "B ..."],
+    noise: Float[Array, "B L"],
+    kl_weight: float,
+) -> tuple[Float[Array, ""], Metrics]:
+    """Return reconstruction error + kl_weight * D_KL(q(z | x) || N(0, 1)), batch means."""
+    latent = vae.encode(states)
+    error = vae.error(states, vae.decode(latent.sample(noise))).mean()
+    kl = latent.kl().mean()
+    total = error + kl_weight * kl
+    return total, {"vae/loss": total, "vae/error": error, "vae/kl": kl}
+
+
+def _stack(
+    channels: int,
+    layers: tuple[tuple[int, int, int], ...],
+    transposed: bool,
+    key: Key[Array, ""],
+) -> tuple[Convolution, ...]:
+    """Return layers given as kernel, stride and output channels."""
+    convolutions = []
+    for (kernel, stride, out), layer_key in zip(
+        layers, jax.random.split(key, len(layers)), strict=True
+    ):
+        pair = (channels, out)
+        convolutions.append(Convolution(kernel, stride, pair, transposed, key=layer_key))
+        channels = out
+    return tuple(convolutions)

@@ -1,0 +1,337 @@
+"""LEAP: the planner on values in closed form, segments and time, both stages, images and pairs."""
+
+import itertools
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from midway.agents import leap, tdm
+from midway.networks.vae import ImageVAE, StateVAE
+from midway.types import Batch, DistanceTask, EnvSpec, Outcome, Pretrained, Remembering, Subgoal
+
+KEY = jax.random.key(3)
+TASK = DistanceTask(((0, 1),), 0.5)
+IMAGE = (84, 84, 3)
+SPECS = {
+    "states": EnvSpec("states", (2,), "float32", (2,), 2, 10, True, None, TASK),
+    "pairs": EnvSpec("pairs", (5,), "float32", (2,), 2, 10, False, None, TASK),
+    "images": EnvSpec("images", IMAGE, "uint8", IMAGE, 2, 10, True, (4,), TASK),
+}
+SMALL = leap.Config(
+    hidden=(16, 16),
+    num_subgoals=3,
+    latent_size=2,
+    vae_hidden=(16, 16),
+    plan_samples=64,
+    plan_iterations=4,
+)
+
+
+def arrays(tree) -> list[np.ndarray]:
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array))]
+
+
+def equal(first, second) -> bool:
+    pairs = zip(arrays(first), arrays(second), strict=True)
+    return all(np.array_equal(a, b) for a, b in pairs)
+
+
+def with_plain_latents(state: leap.State) -> leap.State:
+    """Return the state with an autoencoder whose latent numbers are the state itself."""
+    vae = StateVAE(2, 2, (), key=KEY)
+    plain = (jnp.eye(2), jnp.zeros(2))
+    vae = eqx.tree_at(lambda v: (v.decoder.layers[0].weight, v.decoder.layers[0].bias), vae, plain)
+    return replace(state, vae=vae)
+
+
+def planner(config: leap.Config) -> leap.State:
+    return with_plain_latents(leap.create(config, SPECS["states"], KEY))
+
+
+# --- the planner ----------------------------------------------------------------------------------
+
+
+def straight(state, start, goal, steps_left):
+    """Return minus the distance: of one subgoal the midpoint is best, of three the quarters."""
+    return -jnp.linalg.norm(start - goal, axis=-1)
+
+
+def around_the_wall(state, start, goal, steps_left):
+    """Return minus the way around a wall |x| < 0.5 that is open below y = -2; -9 within it."""
+
+    def corner(point):
+        return jnp.stack([jnp.clip(point[:, 0], -0.5, 0.5), jnp.full(len(point), -2.0)], axis=1)
+
+    def inside(point):
+        return (jnp.abs(point[:, 0]) < 0.5) & (point[:, 1] > -2)
+
+    points = (start, corner(start), corner(goal), goal)
+    way = sum(jnp.linalg.norm(a - b, axis=1) for a, b in itertools.pairwise(points))
+    same_side = points[1][:, 0] == points[2][:, 0]
+    way = jnp.where(same_side, jnp.linalg.norm(start - goal, axis=1), way)
+    return jnp.where(inside(start) | inside(goal), -9.0, -way)
+
+
+def planned(config, start, goal, segment=0, latents=None):
+    if latents is None:
+        latents = jnp.zeros((config.num_subgoals, 2))
+    inputs = jnp.array(start), jnp.array(goal), jnp.array(segment), latents, KEY
+    return np.asarray(jax.jit(leap.plan)(planner(config), *inputs))
+
+
+THOROUGH = replace(SMALL, plan_samples=600, plan_iterations=30, prior_weight=0.0)
+
+
+def test_the_midpoint_is_the_best_subgoal_of_a_straight_way(monkeypatch):
+    monkeypatch.setattr(tdm, "value", straight)
+    plan = planned(replace(THOROUGH, num_subgoals=1), [-1.0, 0.5], [3.0, -1.5])
+    np.testing.assert_allclose(plan, [[1, -0.5]], atol=0.03)
+
+
+def test_several_subgoals_divide_the_way_evenly(monkeypatch):
+    monkeypatch.setattr(tdm, "value", straight)
+    plan = planned(THOROUGH, [-2.0, -2.0], [2.0, 2.0])
+    np.testing.assert_allclose(plan, [[-1, -1], [0, 0], [1, 1]], atol=0.15)
+
+
+def test_the_best_subgoal_past_a_wall_is_at_its_end(monkeypatch):
+    monkeypatch.setattr(tdm, "value", around_the_wall)
+    plan = planned(replace(THOROUGH, num_subgoals=1), [-1.5, 0.0], [1.5, 0.0])
+    np.testing.assert_allclose(plan, [[0, -2]], atol=0.05)
+
+
+def test_the_prior_draws_subgoals_to_likely_states(monkeypatch):
+    monkeypatch.setattr(tdm, "value", straight)
+    config = replace(THOROUGH, num_subgoals=1, prior_weight=0.1)
+    free = planned(replace(config, prior_weight=0.0), [2.0, 0.0], [4.0, 0.0])
+    drawn = planned(config, [2.0, 0.0], [4.0, 0.0])
+    # The smaller leg x - 4 falls by 1 a metre, the log-density rises by 0.1 x: it wins nothing.
+    np.testing.assert_allclose(free, drawn, atol=0.05)
+    far = planned(replace(config, prior_weight=1.0), [2.0, 0.0], [4.0, 0.0])
+    # Now x - 4 - x² / 2 is largest at x = 1.
+    np.testing.assert_allclose(far, [[1, 0]], atol=0.05)
+
+
+def test_score_is_the_worst_segment_to_come_plus_the_prior(monkeypatch):
+    monkeypatch.setattr(tdm, "value", straight)
+    state = planner(replace(SMALL, prior_weight=0.5))
+    latents = jax.random.normal(KEY, (7, 3, 2))
+    start, goal = jnp.array([-3.0, 0.0]), jnp.array([3.0, 1.0])
+    for segment in range(4):
+        score = leap.score(state, latents, start, goal, jnp.array(segment))
+        for row in range(7):
+            to_come = np.asarray(latents[row, segment:])
+            points = np.stack([start, *to_come, goal])
+            worst = np.linalg.norm(np.diff(points, axis=0), axis=1).max()
+            log_density = -(to_come**2).sum() / 2 - to_come.size * np.log(2 * np.pi) / 2
+            assert score[row] == pytest.approx(-worst + 0.5 * log_density, rel=1e-4)
+
+
+def test_replanning_leaves_what_is_over_out(monkeypatch):
+    monkeypatch.setattr(tdm, "value", straight)
+    before = jnp.array([[5.0, 5.0], [1.0, 1.0], [1.0, 1.0]])
+    plan = planned(THOROUGH, [-2.0, 0.0], [2.0, 0.0], segment=2, latents=before)
+    np.testing.assert_allclose(plan[2], [0, 0], atol=0.05)
+
+
+# --- segments and time ----------------------------------------------------------------------------
+
+
+def test_segments_share_the_episode():
+    spec = replace(SPECS["states"], max_episode_steps=600)
+    ant = leap.Config()
+    assert ant.num_subgoals == 11
+    assert leap.segment_steps(ant, spec) == 50
+    assert leap.segment_steps(replace(ant, max_steps_left=100), spec) == 50
+    assert leap.segment_steps(replace(ant, max_steps_left=24), spec) == 25  # at most the horizon
+    push = leap.Config(num_subgoals=3, max_steps_left=25)
+    assert leap.segment_steps(push, replace(spec, max_episode_steps=100)) == 25
+
+
+def follow(state, memory, steps, monkeypatch):
+    """Return for each step the plans made so far, the aim, and the steps left, of one episode."""
+    counted = []
+    monkeypatch.setattr(leap, "plan", lambda state, o, g, segment, latents, key: latents + 1)
+    seen = []
+    policy = type(state.policy).__call__
+    monkeypatch.setattr(
+        type(state.policy),
+        "__call__",
+        lambda self, *inputs: seen.append(inputs) or policy(self, *inputs),
+    )
+    observation, goal = jnp.zeros((len(memory.elapsed), 2)), jnp.full((len(memory.elapsed), 2), 9.0)
+    for _ in range(steps):
+        seen.clear()
+        _, memory = leap.act_on(state, memory, observation, goal, KEY, False)
+        _, aim, steps_left = next(inputs for inputs in seen if len(inputs) == 3)
+        counted.append((memory.latents[:, 0, 0], aim[:, 0], steps_left[:, 0]))
+    plans, aims, left = (np.asarray(jnp.stack(x)) for x in zip(*counted, strict=True))
+    return plans, aims, left, memory
+
+
+def test_a_plan_is_made_at_the_start_of_every_segment_but_the_last(monkeypatch):
+    state = planner(SMALL)
+    memory = leap.begin(SMALL, SPECS["states"], 1)
+    plans, aims, left, memory = follow(state, memory, 10, monkeypatch)
+    assert plans[:, 0].tolist() == [1, 1, 1, 2, 2, 2, 3, 3, 3, 3]
+    # Subgoals are the plan's numbers here; the last segment aims at the goal itself.
+    assert aims[:, 0].tolist() == [1, 1, 1, 2, 2, 2, 3, 3, 3, 9]
+    assert left[:, 0].tolist() == [2, 1, 0, 2, 1, 0, 2, 1, 0, 2]
+    assert memory.elapsed.tolist() == [10]
+
+
+def test_episodes_at_different_times_plan_on_their_own(monkeypatch):
+    state = planner(SMALL)
+    memory = leap.begin(SMALL, SPECS["states"], 3)._replace(elapsed=jnp.array([0, 2, 40]))
+    plans, aims, left, _ = follow(state, memory, 3, monkeypatch)
+    assert plans.T.tolist() == [[1, 1, 1], [0, 1, 1], [0, 0, 0]]
+    assert aims.T.tolist() == [[1, 1, 1], [0, 1, 1], [9, 9, 9]]
+    assert left.T.tolist() == [[2, 1, 0], [0, 2, 1], [1, 0, 2]]
+
+
+def test_exploration_is_the_tdm_without_a_plan():
+    state = leap.create(SMALL, SPECS["states"], KEY)
+    memory = leap.begin(SMALL, SPECS["states"], 4)
+    start, goal = jnp.ones((4, 2)), jnp.zeros((4, 2))
+    actions, after = leap.act_on(state, memory, start, goal, KEY, True)
+    expected, explorer = tdm.act_on(state, memory.explorer, start, goal, KEY, True)
+    np.testing.assert_array_equal(actions, expected)
+    assert equal(after, memory._replace(explorer=explorer))
+
+
+@pytest.mark.parametrize("kind", SPECS)
+def test_actions_are_in_bounds_and_repeatable(kind):
+    spec = SPECS[kind]
+    config = replace(SMALL, plan_samples=8, plan_iterations=2)
+    state = leap.create(config, spec, KEY)
+    observation = jnp.ones((2, *spec.observation_shape), spec.observation_dtype)
+    goal = jnp.zeros((2, *spec.goal_shape), spec.observation_dtype)
+    act = eqx.filter_jit(leap.act)
+    for explore in (False, True):
+        actions = act(state, observation, goal, KEY, explore)
+        assert actions.shape == (2, 2)
+        assert jnp.abs(actions).max() <= 1
+        np.testing.assert_array_equal(actions, act(state, observation, goal, KEY, explore))
+
+
+# --- subgoals -------------------------------------------------------------------------------------
+
+
+def test_subgoals_have_both_roles():
+    state = leap.create(SMALL, SPECS["pairs"], KEY)
+    latent = jax.random.normal(KEY, (4, 2))
+    subgoal = leap.subgoal_codes(state, latent)
+    both = state.vae.decode(latent)
+    np.testing.assert_array_equal(subgoal.observation, both[:, :5])
+    np.testing.assert_array_equal(subgoal.achieved_goal, both[:, 5:])
+
+
+def test_image_subgoals_are_decoded_and_encoded_again():
+    state = leap.create(replace(SMALL, latent_size=6), SPECS["images"], KEY)
+    assert isinstance(state.vae, ImageVAE)
+    assert state.policy.layers[0].weight.shape[0] == 6 + 6 + 1
+    latent = jax.random.normal(KEY, (3, 6))
+    subgoal = leap.subgoal_codes(state, latent)
+    expected = state.vae.encode(state.vae.decode(latent)).mean
+    np.testing.assert_allclose(subgoal.observation, expected, rtol=1e-5)
+    assert subgoal.observation is subgoal.achieved_goal
+
+
+# --- learning -------------------------------------------------------------------------------------
+
+
+def draw_batch(spec: EnvSpec, size: int) -> Batch:
+    rng = np.random.default_rng(0)
+
+    def draw(shape):
+        if spec.is_image:
+            return jnp.asarray(rng.integers(0, 256, (size, *shape)), jnp.uint8)
+        return jnp.asarray(rng.normal(size=(size, *shape)), jnp.float32)
+
+    observation, following = draw(spec.observation_shape), draw(spec.observation_shape)
+    goal = draw(spec.goal_shape)
+    size_of_truth = (spec.state_shape or spec.goal_shape)[0]
+    truth = [jnp.asarray(rng.normal(size=(size, size_of_truth)), jnp.float32) for _ in range(2)]
+    return Batch(
+        observation=observation,
+        action=jnp.asarray(rng.uniform(-1, 1, (size, 2)), jnp.float32),
+        reward=-jnp.ones(size),
+        terminated=jnp.zeros(size, bool),
+        next_observation=following,
+        goal=goal,
+        subgoal_candidate=Subgoal(observation, goal),
+        outcome=None if spec.goal_is_observation and not spec.is_image else Outcome(*truth),
+    )
+
+
+@pytest.mark.parametrize("kind", SPECS)
+def test_updates_are_those_of_the_tdm_and_leave_the_autoencoder(kind):
+    spec = SPECS[kind]
+    state, batch = leap.create(SMALL, spec, KEY), draw_batch(spec, 8)
+    copies = arrays((state, batch))
+    after, metrics = eqx.filter_jit(leap.update)(state, batch, KEY)
+    assert all(np.array_equal(a, b) for a, b in zip(copies, arrays((state, batch)), strict=True))
+    assert isinstance(after, leap.State)
+    assert equal(after.vae, state.vae)
+    assert not equal(after.critic, state.critic)
+    assert set(metrics) == {
+        f"{group}" for group in ("critic/loss", "critic/q", "critic/target")
+    } | {"policy/loss", "policy/saturation"}
+    if kind == "states":
+        expected, _ = eqx.filter_jit(tdm.update)(state, batch, KEY)
+        assert equal(after, expected)
+    if kind == "images":
+        assert state.critic[0].layers[-1].weight.shape[1] == 4  # rewards are of the true state
+
+
+def test_pretraining_teaches_the_autoencoder_alone():
+    spec = SPECS["states"]
+    config = replace(SMALL, vae_kl_weight=1e-3, vae_learning_rate=3e-3, vae_updates=150)
+    state = leap.create(config, spec, KEY)
+    positions = jax.random.uniform(KEY, (2_000, 2), minval=-6.0, maxval=6.0)
+    states = Subgoal(positions, positions)
+    one_round = eqx.filter_jit(leap.pretrain)
+    distances, after = [], state
+    for number in range(8):
+        after, metrics = one_round(after, states, jax.random.key(number))
+        distances.append(float(metrics["vae/held_out_distance"]))
+    assert distances[-1] < 0.4 < distances[0]
+    assert metrics["vae/loss"] == pytest.approx(
+        metrics["vae/error"] + 1e-3 * metrics["vae/kl"], rel=1e-4
+    )
+    others = set(vars(state)) - {"vae", "vae_optimizer", "config", "spec", "encoder"}
+    assert all(equal(getattr(state, name), getattr(after, name)) for name in others)
+    np.testing.assert_allclose(after.vae.center, positions[:1_800].mean(0), rtol=1e-5)
+
+
+def test_pretraining_reads_both_roles_of_a_state():
+    spec = SPECS["pairs"]
+    state = leap.create(replace(SMALL, vae_updates=2), spec, KEY)
+    states = Subgoal(jax.random.normal(KEY, (100, 5)), jax.random.normal(KEY, (100, 2)))
+    after, _ = leap.pretrain(state, states, KEY)
+    assert after.vae.center.shape == (7,)
+
+
+def test_settings_of_the_stage_before():
+    settings = leap.pretraining(leap.Config(vae_source="runs/other"))
+    assert settings.networks == ("vae",)
+    assert (settings.states, settings.rounds, settings.source) == (50_000, 2_500, "runs/other")
+
+
+def test_leap_and_tdm_keep_the_optional_contracts():
+    assert isinstance(leap, Remembering)
+    assert isinstance(leap, Pretrained)
+    assert isinstance(tdm, Remembering)
+    assert not isinstance(tdm, Pretrained)
+
+
+def test_defaults_are_those_of_the_ant():
+    config = leap.Config()
+    assert (config.num_subgoals, config.latent_size, config.vae_hidden) == (11, 8, (64, 128, 64))
+    assert (config.plan_samples, config.plan_iterations) == (10_000, 50)
+    assert (config.plan_elites, config.plan_std, config.prior_weight) == ((0.25, 0.01), 1.5, 0.1)
+    assert (config.vae_batch_size, config.vae_updates, config.vae_rounds) == (128, 100, 2_500)

@@ -1,0 +1,145 @@
+"""Autoencoders: shapes, losses by hand, and reconstruction after a short training."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from midway.networks import optimizer, vae
+from midway.types import DistanceTask, EnvSpec
+
+KEY = jax.random.key(0)
+TASK = DistanceTask(((0, 1),), 0.5)
+IMAGE = (84, 84, 3)
+SPECS = {
+    "states": EnvSpec("states", (5,), "float32", (5,), 2, 50, True, None, TASK),
+    "pairs": EnvSpec("pairs", (5,), "float32", (2,), 2, 50, False, None, TASK),
+    "images": EnvSpec("images", IMAGE, "uint8", IMAGE, 2, 50, True, (4,), TASK),
+}
+
+
+def trained(model, states, kl_weight, steps, rate=3e-3, batch=64):
+    """Return the autoencoder after some steps of Adam."""
+
+    def step(carry, key):
+        model, state = carry
+        rows_key, noise_key = jax.random.split(key)
+        rows = states[jax.random.randint(rows_key, (batch,), 0, len(states))]
+        noise = jax.random.normal(noise_key, (batch, model_latents))
+        gradient = eqx.filter_grad(lambda m: vae.loss(m, rows, noise, kl_weight)[0])(model)
+        return optimizer.step(model, gradient, state, rate), None
+
+    model_latents = model.encode(states[:1]).mean.shape[1]
+    carry = (model, optimizer.init(model))
+    return jax.jit(lambda c, k: jax.lax.scan(step, c, k))(carry, jax.random.split(KEY, steps))[0][0]
+
+
+def test_kl_by_hand():
+    latent = vae.Latent(jnp.array([[1.0, -2.0]]), jnp.log(jnp.array([[4.0, 0.25]])))
+    expected = 0.5 * ((1 + 4 - 1 - np.log(4)) + (4 + 0.25 - 1 - np.log(0.25)))
+    np.testing.assert_allclose(latent.kl(), [expected], rtol=1e-6)
+    standard = vae.Latent(jnp.zeros((3, 2)), jnp.zeros((3, 2)))
+    np.testing.assert_array_equal(standard.kl(), jnp.zeros(3))
+
+
+def test_samples_have_the_distribution():
+    latent = vae.Latent(jnp.full((50_000, 1), 3.0), jnp.full((50_000, 1), jnp.log(4.0)))
+    samples = latent.sample(jax.random.normal(KEY, (50_000, 1)))
+    assert samples.mean() == pytest.approx(3, abs=0.05)
+    assert samples.std() == pytest.approx(2, abs=0.05)
+
+
+def test_states_are_standardised_and_constant_entries_only_centred():
+    states = jnp.array([[0.0, 5.0], [4.0, 5.0]])
+    model = vae.StateVAE(2, 1, (8,), key=KEY).standardised(states)
+    np.testing.assert_allclose(model.center, [2, 5])
+    np.testing.assert_allclose(model.scale, [2, 1])
+    error = model.error(states, states + jnp.array([2.0, 1.0]))
+    np.testing.assert_allclose(error, [1, 1])  # ((2 / 2)² + 1²) / 2
+    # Output layers start small: a new decoder returns about the mean of the data.
+    np.testing.assert_allclose(model.decode(jnp.ones((1, 1))), [[2, 5]], atol=0.05)
+
+
+def test_standardisation_is_not_learned():
+    states = jax.random.normal(KEY, (64, 3)) * 7 + 2
+    model = vae.StateVAE(3, 2, (8,), key=KEY).standardised(states)
+    after = trained(model, states, 1e-3, 5)
+    assert jnp.array_equal(after.center, model.center)
+    assert jnp.array_equal(after.scale, model.scale)
+    assert not jnp.array_equal(after.decoder.layers[0].weight, model.decoder.layers[0].weight)
+
+
+def test_states_on_a_plane_are_reconstructed_from_two_numbers():
+    position = jax.random.uniform(KEY, (2_000, 2), minval=-8.0, maxval=8.0)
+    states = jnp.concatenate([position, jnp.full((2_000, 2), 0.565), -position[:, :1]], axis=1)
+    model = vae.StateVAE(5, 2, (32, 32), key=KEY).standardised(states)
+    model = trained(model, states, 1e-3, 1_500)
+    reconstruction = model.decode(model.encode(states).mean)
+    distance = jnp.linalg.norm((reconstruction - states)[:, :2], axis=1)
+    assert distance.mean() < 0.25
+    latents = model.encode(states)
+    assert 0.5 < latents.mean.std() < 2  # the prior holds the codes together
+
+
+def test_loss_is_error_plus_weighted_divergence():
+    states = jax.random.normal(KEY, (16, 3))
+    model = vae.StateVAE(3, 2, (8,), key=KEY)
+    for weight in (0.0, 2.0):
+        total, metrics = vae.loss(model, states, jnp.zeros((16, 2)), weight)
+        expected = metrics["vae/error"] + weight * metrics["vae/kl"]
+        np.testing.assert_allclose(total, expected, rtol=1e-6)
+    latent = model.encode(states)
+    by_hand = ((states - model.decode(latent.mean)) ** 2).mean()
+    np.testing.assert_allclose(metrics["vae/error"], by_hand, rtol=1e-5)
+
+
+def test_image_layers_have_the_sizes_of_the_appendix():
+    model = vae.ImageVAE(16, key=KEY)
+    images = jnp.zeros((2, *IMAGE))
+    sizes = [images.shape[1:]]
+    for convolution in model.convolutions:
+        images = convolution(images)
+        sizes.append(images.shape[1:])
+    assert sizes == [(84, 84, 3), (27, 27, 16), (8, 8, 16), (2, 2, 32)]
+    for deconvolution in model.deconvolutions:
+        images = deconvolution(images)
+        sizes.append(images.shape[1:])
+    assert sizes[4:] == [(8, 8, 32), (27, 27, 16), (84, 84, 3)]
+    assert [c.weight.shape[0] for c in model.convolutions] == [5, 5, 5]
+    assert [c.weight.shape[0] for c in model.deconvolutions] == [5, 6, 6]
+
+
+def test_image_values_may_be_bytes_or_shares():
+    model = vae.ImageVAE(16, key=KEY)
+    image = jax.random.randint(KEY, (3, *IMAGE), 0, 256).astype(jnp.uint8)
+    latent = model.encode(image)
+    assert latent.mean.shape == latent.log_variance.shape == (3, 16)
+    np.testing.assert_allclose(latent.mean, model.encode(image / 255.0).mean, atol=1e-5)
+    assert latent.log_variance.min() >= np.log(1e-4) - 1e-5
+    error = model.error(image, image / 255.0 + 0.1)
+    np.testing.assert_allclose(error, 84 * 84 * 3 * 0.01, rtol=1e-4)
+
+
+def test_images_of_a_moving_square_are_reconstructed():
+    def image(corner):
+        return jnp.zeros(IMAGE).at[corner[0] : corner[0] + 30, corner[1] : corner[1] + 30].set(255)
+
+    corners = [(row, column) for row in (0, 25, 50) for column in (0, 25, 50)]
+    images = jnp.stack([image(corner) for corner in corners]).astype(jnp.uint8)
+    model = vae.ImageVAE(4, key=KEY)
+    before = model.error(images, model.decode(model.encode(images).mean)).mean()
+    model = trained(model, images, 1e-3, 120, batch=8)
+    after = model.error(images, model.decode(model.encode(images).mean)).mean()
+    assert after < 0.3 * before
+
+
+@pytest.mark.parametrize(("kind", "size"), [("states", 5), ("pairs", 7), ("images", None)])
+def test_create_suits_the_environment(kind, size):
+    model = vae.create(SPECS[kind], 3, (16, 8), KEY)
+    if size is None:
+        assert isinstance(model, vae.ImageVAE)
+        return
+    assert model.decode(jnp.zeros((4, 3))).shape == (4, size)
+    assert [layer.weight.shape[1] for layer in model.encoder.layers] == [16, 8, 6]
+    assert [layer.weight.shape[1] for layer in model.decoder.layers] == [8, 16, size]
