@@ -80,7 +80,8 @@ QUICK = {
         checkpoint_every=25_000,
     ),
 }
-"""The loop by family of environments; others take the point's."""
+QUICK["point-omega"] = replace(QUICK["point"], steps=48_000)  # [curves] the longest way
+"""The loop by environment or family of environments; others take the point's."""
 
 QUICK_HYPERPARAMETERS: dict[tuple[str, str], dict[str, Any]] = {
     ("point", "ris"): {"subgoal_learning_rate": 1e-3},  # [curves] fewer updates than the paper
@@ -107,5 +108,5 @@ def preset(env: str, agent: str, name: str) -> tuple[TrainConfig, Any]:
         return PAPER, config(**values)
     family = env.partition("-")[0]
     changes = QUICK_HYPERPARAMETERS.get((family, agent), {})
-    train = QUICK.get(family, QUICK["point"])
+    train = QUICK.get(env) or QUICK.get(family, QUICK["point"])
     return train, config(**{**values, **changes, "precision": fastest_precision()})

@@ -1,6 +1,7 @@
 """Stopped and resumed runs equal those that were never stopped."""
 
 import csv
+import json
 import os
 import signal
 import subprocess
@@ -145,6 +146,9 @@ def test_resume_with_more_steps_goes_on(whole_run: Path, tmp_path: Path) -> None
     assert midway.resume(run.path, steps=400).finished
     assert rows(run.path / "evaluation.csv") == rows(whole_run / "evaluation.csv")
     assert midway.resume(run.path, steps=300).finished
+    record = json.loads((run.path / "config.json").read_text())
+    assert [entry["steps"] for entry in record["resumed"]] == [400, 300]
+    assert RunFolder(run.path).load_config().train.steps == 300
 
 
 def test_updates_keep_their_ratio_exactly(whole_run: Path) -> None:

@@ -126,7 +126,9 @@ def resume(path: str | Path, steps: int | None = None, progress: bool = False) -
         config = dataclasses.replace(
             config, train=dataclasses.replace(config.train, steps=int(steps))
         )
-    return _run(build(config, folder), progress)
+    training = build(config, folder)
+    folder.note_resume(config)
+    return _run(training, progress)
 
 
 def load(path: str | Path) -> Policy:

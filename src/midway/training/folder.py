@@ -135,6 +135,13 @@ class RunFolder:
                 f"cannot make run folder {self.path}: {error.strerror}"
             ) from error
 
+    def note_resume(self, config: RunConfig) -> None:
+        """Add to ``config.json`` how the run was continued, and its new number of steps."""
+        values = read_json(self.config_file)
+        again = {**provenance(), "steps": config.train.steps}
+        continued = {**values, **config.to_json(), "resumed": [*values.get("resumed", []), again]}
+        write_json(self.config_file, continued)
+
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Keep other processes from training the same run.
