@@ -198,6 +198,7 @@ def test_pucks_stay_on_the_table_and_inside_whatever_happens():
         keep_going(env)
         observed = env.step(actions)[0]
         assert env.observation_space.contains(observed)
+        assert (env._qpos[:, env._arm.addresses[2]] > 1).all()  # the elbow keeps to its side
         pucks = observed["observation"][:, 2:]
         beyond = np.maximum(PUCK_LIMITS[0] - pucks, pucks - PUCK_LIMITS[1])
         furthest = max(furthest, beyond.max())

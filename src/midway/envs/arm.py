@@ -1,8 +1,9 @@
 """The Sawyer arm: joints and inertias of the original robot, drawn with shapes of our own.
 
 The chain stands at the origin and looks along y. A hand pose fixes six of its seven joints; gravity
-decides about the seventh: the arm sinks until its second joint rests on its upper limit, wherever
-in the workspace the hand is. So that joint is taken as given and the others follow from the hand.
+decides about the seventh: the arm sinks to one side until its second joint rests on its upper
+limit. With the elbow on the side of +x it then stays so wherever in the workspace the hand goes.
+So that joint is taken as given, and the six others follow from the hand.
 """
 
 from typing import NamedTuple
