@@ -4,6 +4,7 @@ Each job is one Ray task of one processor. A task whose machine is lost is run a
 where it resumes from the newest whole checkpoint.
 """
 
+import socket
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from midway.cluster.jobs import Job, State, execute, finished
 from midway.types import ConfigurationError
 
 RETRIES = 20
+REACH_SECONDS = 10.0
 
 
 def start(
@@ -29,6 +31,7 @@ def start(
         raise ConfigurationError(
             "--ray needs the extra `cluster`: pip install 'midway[cluster]'"
         ) from error
+    _check_reached(address)
     try:
         ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
     except (ConnectionError, ValueError) as error:
@@ -51,6 +54,17 @@ def start(
                 states[running[reference]] = _result(ray, reference)
 
     return [threading.Thread(target=collect, daemon=True)]
+
+
+def _check_reached(address: str) -> None:
+    """Fail at once where nobody listens; Ray itself would go on trying for minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not (colon and port.isdecimal()):
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=REACH_SECONDS).close()
+    except OSError as error:
+        raise ConfigurationError(f"Ray cluster {address} is not reached: {error}") from error
 
 
 def _run_to_its_end(job: Job, folder: str) -> bool:
