@@ -1,10 +1,11 @@
 """Values for each agent and environment: ``paper`` as published, ``quick`` for two cores.
 
-Sources: [1] table 1, [B] appendix B, [D] appendix D, [code] the original implementation where the
-paper is silent, [curves] measured here with ``benchmarks/run.py``.
+Sources: [1] table 1, [2] table 2, [B] appendix B, [D] appendix D, [code] the original code of RIS
+where the paper is silent, [LEAP] that of LEAP, [curves] measured here with ``benchmarks/run.py``,
+[leap.md] measured here, see ``docs/algorithms/leap.md``.
 """
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any, Literal, TypeAlias, get_args
 
 from midway.agents import registry
@@ -51,7 +52,77 @@ SAC_PAPER: dict[str, Any] = {
     "entropy_learning_rate": 1e-3,  # as the policy's
     "encoder_learning_rate": 1e-4,  # [code] of RIS
 }
-HYPERPARAMETERS = {"ris": RIS_PAPER, "sac": SAC_PAPER, "tdm": {}, "leap": {}}
+LEAP_PAPER: dict[str, Any] = {
+    "hidden": (400, 300),  # [D]
+    "max_steps_left": 50,  # [2]
+    "reward_scale": 10.0,  # [LEAP]
+    "target_update_rate": 5e-3,  # [LEAP]
+    "policy_delay": 2,  # [LEAP]
+    "critic_learning_rate": 1e-3,  # [LEAP]
+    "policy_learning_rate": 1e-3,  # [LEAP]
+    "encoder_learning_rate": 1e-4,  # of RIS; for tdm on images
+    "target_noise": 0.2,  # [LEAP]
+    "target_noise_bound": 0.5,  # [LEAP]
+    "saturation_weight": 1.0,  # [LEAP] ant
+    "saturation_bound": 20.0,  # [LEAP] ant
+    "exploration_noise": 0.3,  # [LEAP] σ
+    "exploration_reversion": 0.15,  # [LEAP] θ
+    "num_subgoals": 11,  # [2]
+    "latent_size": 8,  # [D] ant
+    "vae_hidden": (64, 128, 64),  # [D]
+    "vae_kl_weight": 1e-4,  # [leap.md] [LEAP] has 1e-2, which loses the position
+    "vae_learning_rate": 1e-3,  # [LEAP]
+    "vae_states": 50_000,  # [LEAP]
+    "vae_random_actions": 0,  # [leap.md] [LEAP] has 1, which loses the position
+    "vae_rounds": 2_500,  # [LEAP]
+    "vae_updates": 100,  # [LEAP]
+    "vae_batch_size": 128,  # [LEAP]
+    "plan_samples": 10_000,  # [LEAP] ant
+    "plan_iterations": 50,  # [LEAP] ant
+    "plan_elites": (0.25, 0.01),  # [LEAP] ant
+    "plan_std": 1.5,  # [LEAP]
+    "prior_weight": 0.1,  # [LEAP] ant
+}
+"""LEAP, and TDM as far as it has these."""
+
+HYPERPARAMETERS = {"ris": RIS_PAPER, "sac": SAC_PAPER, "tdm": LEAP_PAPER, "leap": LEAP_PAPER}
+
+LEAP_TASKS: dict[str, dict[str, Any]] = {
+    "ant": {"num_rewards": 17},  # [LEAP] positions
+    "ant-pi": {"max_steps_left": 75},  # [2]
+    "ant-omega": {"max_steps_left": 100},  # [2]
+    "push": {
+        "max_steps_left": 25,  # [2]
+        "num_rewards": 4,  # [LEAP] hand and puck
+        "saturation_weight": 0.0,  # [LEAP]
+        "num_subgoals": 3,  # [2]
+        "latent_size": 16,  # [D]
+        "vae_kl_weight": 2.5,  # [LEAP]
+        "vae_random_actions": 4,  # [LEAP]
+        "plan_samples": 1_000,  # [LEAP]
+        "plan_iterations": 15,  # [LEAP]
+        "plan_elites": (0.05,),  # [LEAP]
+        "prior_weight": 1e-3,  # [LEAP]
+    },
+    "point": {  # not in the paper: [leap.md]
+        "max_steps_left": 14,
+        "num_rewards": 2,
+        "num_subgoals": 9,
+        "latent_size": 2,
+        "vae_kl_weight": 1e-3,
+    },
+}
+"""What differs by family of environments or environment, for ``tdm`` and ``leap``."""
+
+LEAP_LOOP: dict[str, Any] = {
+    "random_steps": 3_000,  # [LEAP] the first update
+    "relabel": RelabelMix(own=0.4, random=0.2, future=0.4),  # [LEAP] own and fresh goals as one
+}
+PAPER_LOOPS: dict[str, dict[str, Any]] = {
+    "tdm": LEAP_LOOP,
+    "leap": LEAP_LOOP | {"evaluate_every": 250_000},  # an episode of the ant is 11 plans
+}
+"""What differs in the loop by agent."""
 
 QUICK = {
     "point": replace(
@@ -83,10 +154,30 @@ QUICK = {
 QUICK["point-omega"] = replace(QUICK["point"], steps=48_000)  # [curves] the longest way
 """The loop by environment or family of environments; others take the point's."""
 
+LEAP_QUICK = {"vae_rounds": 300, "plan_samples": 1_000, "plan_iterations": 20}  # [leap.md]
+LEAP_QUICK_POINT: dict[str, Any] = {  # [leap.md]
+    "hidden": (128, 128),
+    "target_update_rate": 0.02,
+    "vae_states": 5_000,
+    "vae_rounds": 30,
+    "plan_samples": 256,
+    "plan_iterations": 15,
+}
 QUICK_HYPERPARAMETERS: dict[tuple[str, str], dict[str, Any]] = {
     ("point", "ris"): {"subgoal_learning_rate": 1e-3},  # [curves] fewer updates than the paper
+    ("any", "leap"): LEAP_QUICK,
+    ("point", "tdm"): LEAP_QUICK_POINT,
+    ("point", "leap"): LEAP_QUICK_POINT,
 }
 """What ``quick`` changes in an agent, by family of environments and agent."""
+
+QUICK_LOOPS: dict[tuple[str, str], dict[str, Any]] = {
+    ("any", "tdm"): {"relabel": LEAP_LOOP["relabel"]},
+    ("any", "leap"): {"relabel": LEAP_LOOP["relabel"], "evaluate_every": 16_000},
+    ("ant", "leap"): {"evaluate_every": 75_000},
+    ("point", "leap"): {"evaluate_every": 8_000},
+}
+"""What ``quick`` changes in the loop, by family of environments and agent."""
 
 
 def preset(env: str, agent: str, name: str) -> tuple[TrainConfig, Any]:
@@ -102,11 +193,20 @@ def preset(env: str, agent: str, name: str) -> tuple[TrainConfig, Any]:
     """
     if name not in get_args(PresetName):
         raise ConfigurationError(f"unknown preset {name!r}: choose one of paper, quick")
-    config = registry.get(agent).Config
+    config, family = registry.get(agent).Config, env.partition("-")[0]
     values = HYPERPARAMETERS[agent]
+    if agent in ("tdm", "leap"):
+        values = values | LEAP_TASKS.get(family, {}) | LEAP_TASKS.get(env, {})
     if name == "paper":
-        return PAPER, config(**values)
-    family = env.partition("-")[0]
-    changes = QUICK_HYPERPARAMETERS.get((family, agent), {})
+        return replace(PAPER, **PAPER_LOOPS.get(agent, {})), config(**_known(config, values))
     train = QUICK.get(env) or QUICK.get(family, QUICK["point"])
-    return train, config(**{**values, **changes, "precision": fastest_precision()})
+    for key in (("any", agent), (family, agent)):
+        train = replace(train, **QUICK_LOOPS.get(key, {}))
+        values = values | QUICK_HYPERPARAMETERS.get(key, {})
+    return train, config(**_known(config, values), precision=fastest_precision())
+
+
+def _known(config: Any, values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values that the configuration has a field for."""
+    names = {field.name for field in fields(config)}
+    return {name: value for name, value in values.items() if name in names}
