@@ -10,6 +10,7 @@ import pytest
 from midway.training import api
 
 TINY = {
+    "num_envs": 8,
     "random_steps": 200,
     "updates_per_step": 0.125,
     "batch_size": 32,

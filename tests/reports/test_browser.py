@@ -15,7 +15,7 @@ addEventListener("load", () => {
   const images = [...document.images];
   const loaded = images.filter(i => i.complete && i.naturalWidth > 500 && i.alt).length;
   const fetched = performance.getEntriesByType("resource").filter(e => !e.name.startsWith("data:"));
-  const wide = document.documentElement.scrollWidth - innerWidth;
+  const wide = document.body.scrollWidth - document.body.clientWidth;
   document.title = `images ${images.length} loaded ${loaded} fetched ${fetched.length}` +
     ` wide ${wide}`;
 });

@@ -4,14 +4,16 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from midway.reports import imagination, watch
+from midway.reports import imagination, videos, watch
 from midway.reports.rollouts import record
 from midway.training import api
 from midway.types import ConfigurationError
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio's reader
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
-def test_a_video_can_be_read(ris_run, tmp_path, suffix):
+def test_a_video_can_be_read(ris_run, tmp_path, suffix, monkeypatch):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")  # which it forks for
     file = tmp_path / "videos" / f"hard{suffix}"
     assert watch(ris_run, file, task="hard", episodes=1, seed=0) == file
     frames = list(imageio.imiter(file))
@@ -38,6 +40,14 @@ def test_the_default_place_is_in_the_run_folder(sac_run, copy_run):
 def test_bad_requests_are_one_line(ris_run, tmp_path, name, task, episodes, words):
     with pytest.raises(ConfigurationError, match=words) as error:
         watch(ris_run, tmp_path / name, task, episodes, 0)
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_ffmpeg_says_is_told(tmp_path):
+    frames = iter([np.zeros((0, 0, 3), np.uint8)])
+    with pytest.raises(ConfigurationError, match=r"a\.mp4: .*[Ii]nvalid") as error:
+        videos.write(tmp_path / "a.mp4", frames, 10)
     assert "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
 

@@ -53,7 +53,8 @@ def _write(runs: Sequence[RunData], out: Path) -> list[Path]:
             lambda: curves.draw_overview(by_env),
             "All environments",
             "Success of mean actions over environment steps, interquartile mean over seeds with "
-            "stratified 95 % bootstrap intervals. The last column takes all environments together.",
+            "stratified 95 % bootstrap intervals; all environments together where they have the "
+            "same agents.",
             "Learning curves of every environment.",
         )
     chapters = [_chapter(env, gathered, out) for env, gathered in by_env.items()]

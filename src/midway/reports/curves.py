@@ -83,7 +83,7 @@ def _together(
             yield first, curve(strata, steps)
 
 
-def thousands(value: float, position: float = 0) -> str:
+def thousands(value: float | int, position: object = None) -> str:
     """Return a number of steps in short: 8k, 1.5M."""
     for size, letter in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:

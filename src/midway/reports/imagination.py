@@ -59,7 +59,7 @@ def chain(policy: Policy, observation: Array, goal: Array, depth: int) -> Array:
     """
     if depth == 0:
         return np.empty((0, *goal.shape))
-    vector = np.asarray(_distribution(policy.state, observation[None], goal[None])[0])
+    vector = _distribution(policy.state, observation[None], goal[None])[0]
     middle = policy.agent.as_subgoal(policy.state.spec, vector)
     reached, onwards = np.asarray(middle.achieved_goal), np.asarray(middle.observation)
     before = chain(policy, observation, reached[0], depth - 1)

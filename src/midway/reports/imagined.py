@@ -124,7 +124,8 @@ def draw_values(studies: Mapping[str, Study], bound: float) -> Figure:
         colours = {"cmap": "viridis", "vmin": lowest, "vmax": 0, "zorder": 1}
         image = show_image(panel, maze, shades, x, y, **colours)
         case = maze.cases["hard"]
-        maps.draw_ends(panel, *(np.array([box.x, box.y]) for box in (case.start, case.goal)))
+        start, goal = (np.array([box.x, box.y]) for box in (case.start, case.goal))
+        maps.draw_ends(panel, start, goal)
         style.caption(panel, label, f"step {thousands(study.run.policy_step)}")
     bar = figure.colorbar(image, ax=axes, shrink=0.8, fraction=0.06)
     bar.set_label("value of a state for this goal", fontsize=style.TEXT, color=style.INK)

@@ -96,11 +96,13 @@ def draw_path(axes: Axes, episode: Episode) -> None:
     draw_ends(axes, episode.path[0], episode.goal)
 
 
-def draw_ends(axes: Axes, start: Float[np.ndarray, "2"], goal: Float[np.ndarray, "2"]) -> None:
-    """Draw a start and a goal (m)."""
+def draw_ends(
+    axes: Axes, start: Float[np.ndarray, "2"], goal: Float[np.ndarray, "2"], size: float = 1.0
+) -> None:
+    """Draw a start and a goal (m), with marks of a size relative to those of figures."""
     outline: dict[str, Any] = {"markeredgecolor": "white", "zorder": 6, "linestyle": ""}
-    axes.plot(*start, marker="o", color=START, markersize=6, **outline)
-    axes.plot(*goal, marker="*", color=GOAL, markersize=12, **outline)
+    axes.plot(*start, marker="o", color=START, markersize=6 * size, **outline)
+    axes.plot(*goal, marker="*", color=GOAL, markersize=12 * size, **outline)
 
 
 def scatter_subgoals(axes: Axes, positions: Float[np.ndarray, "n 2"]) -> None:

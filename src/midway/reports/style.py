@@ -19,8 +19,8 @@ RESOLUTION = 150
 NARROW, WIDE = 30, 44
 """Letters in a line of a panel's title and of a legend's entry, at most."""
 
-LEGEND_LETTERS = 150
-"""Letters in a line of a legend."""
+LEGEND_LETTERS = 16.0
+"""Letters of a legend in an inch."""
 
 TEXT, SMALL = 10.0, 8.5
 """Sizes of titles and axis labels, and of everything else (points)."""
@@ -85,7 +85,7 @@ def success_axis(axes: Axes) -> None:
 def legend_below(drawn: Figure, handles: Sequence[Any], title: str = "") -> None:
     """Put one legend under all panels; long names take several lines."""
     names = [textwrap.fill(handle.get_label(), WIDE) for handle in handles]
-    columns = LEGEND_LETTERS // (max(map(len, names)) + 6)
+    columns = int(LEGEND_LETTERS * drawn.get_figwidth()) // (max(map(len, names)) + 6)
     drawn.legend(
         list(handles),
         names,

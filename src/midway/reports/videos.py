@@ -1,13 +1,18 @@
 """Videos of a policy with the subgoals that it imagines on its way."""
 
+import subprocess
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from itertools import chain
 from pathlib import Path
+from subprocess import PIPE
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import imageio_ffmpeg
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.artist import Artist
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from midway.envs import registry as environments
@@ -100,29 +105,35 @@ def write(path: Path, frames: Iterator[Frame], rate: int) -> None:
     Raises:
         ConfigurationError: The file cannot be written.
     """
-    temporary = path.with_name(f".{path.stem}-new{path.suffix}")
     writers: dict[str, Callable[..., None]] = {".mp4": _write_mp4, ".gif": _write_gif}
+    temporary = path.with_name(f".{path.stem}-new{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        writers[path.suffix](temporary, frames, rate)
-        temporary.replace(path)
+        try:
+            writers[path.suffix](temporary, frames, rate)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
-        reason = error.strerror or str(error).splitlines()[0]
+        reason = error.strerror or str(error)
         raise ConfigurationError(f"cannot write the video {path}: {reason}") from error
 
 
 def _write_mp4(path: Path, frames: Iterator[Frame], rate: int) -> None:
+    """Pipe the frames to ffmpeg; imageio's own writer would fork, which JAX's threads forbid."""
     first = next(frames)
-    size = (first.shape[1], first.shape[0])
-    writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=rate, macro_block_size=2, quality=7, ffmpeg_log_level="error"
-    )
-    writer.send(None)
-    writer.send(np.ascontiguousarray(first))
-    for frame in frames:
-        writer.send(np.ascontiguousarray(frame))
-    writer.close()
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y"]
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(rate), "-i", "-"]
+    command += ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    with subprocess.Popen([*command, str(path)], stdin=PIPE, stderr=PIPE) as ffmpeg:
+        assert ffmpeg.stdin is not None
+        with suppress(BrokenPipeError):  # it has ended early and says why
+            for frame in chain([first], frames):
+                ffmpeg.stdin.write(frame.tobytes())
+        _, words = ffmpeg.communicate()
+    if ffmpeg.returncode != 0:
+        raise OSError(" ".join(words.decode(errors="replace").split()) or "ffmpeg failed")
 
 
 def _write_gif(path: Path, frames: Iterator[Frame], rate: int) -> None:
@@ -158,7 +169,8 @@ class MazeScene:
         self._path = recording.achieved[:, POSITION]
         self._subgoals = _imagined(policy, recording)
         self._distances = policy.state.spec.task.distance(recording.achieved, recording.goal)
-        self._figure, self._artists = _stage(maze, title, self._path[0], recording.goal[POSITION])
+        ends = self._path[0], recording.goal[POSITION]
+        self._figure, self._artists = _stage(maze, title, *ends, self._subgoals is not None)
         self._canvas: Any = self._figure.canvas
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(self._figure.bbox)
@@ -194,7 +206,11 @@ def _imagined(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I 2"
 
 
 def _stage(
-    maze: Maze, title: str, start: Float[np.ndarray, "2"], goal: Float[np.ndarray, "2"]
+    maze: Maze,
+    title: str,
+    start: Float[np.ndarray, "2"],
+    goal: Float[np.ndarray, "2"],
+    subgoals: bool,
 ) -> tuple[Any, Sequence[Any]]:
     """Return the figure with all that stands still, and what moves: trail, agent, subgoals, words.
 
@@ -204,7 +220,7 @@ def _stage(
     figure.set_dpi(PIXELS)
     axes.set(xlabel="", ylabel="", xticks=[], yticks=[])
     axes.set_title(f"{title}\n", fontsize=style.TEXT, color=style.INK)
-    maps.draw_ends(axes, start, goal)
+    maps.draw_ends(axes, start, goal, size=1.4)
     diamonds: dict[str, Any] = {
         "marker": "D",
         "color": maps.SUBGOAL,
@@ -221,4 +237,13 @@ def _stage(
     ]
     for artist in moving:
         artist.set_animated(True)
+    agent = Line2D([], [], color=style.BLUE, marker="o", markersize=9, linewidth=2, label="agent")
+    style.legend_below(figure, [agent, *maps.ends_legend(), *_subgoals_entry(subgoals)])
     return figure, moving
+
+
+def _subgoals_entry(subgoals: bool) -> list[Line2D]:
+    """Return the entry of the imagined subgoals, if there are any."""
+    words = "imagined subgoals"
+    mark = Line2D([], [], color=maps.SUBGOAL, marker="D", linestyle="", label=words)
+    return [mark] if subgoals else []
