@@ -103,7 +103,10 @@ def _save_weights(path: Path, config: RunConfig, state: Any) -> None:
     networks = _networks(registry.get(config.agent), state)
     arrays = {name: np.asarray(array) for name, array in named_arrays(networks).items()}
     temporary = path.with_name(path.name + ".new")
-    save_file(arrays, temporary)
+    try:
+        save_file(arrays, temporary)
+    except SafetensorError as error:
+        raise OSError(f"{path} cannot be written: {error}") from error
     temporary.replace(path)
 
 
