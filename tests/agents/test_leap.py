@@ -80,7 +80,8 @@ def planned(config, start, goal, segment=0, latents=None):
     if latents is None:
         latents = jnp.zeros((config.num_subgoals, 2))
     inputs = jnp.array(start), jnp.array(goal), jnp.array(segment), latents, KEY
-    return np.asarray(jax.jit(leap.plan)(planner(config), *inputs))
+    # A function of its own: compiled ones are kept by function, and the value here is patched.
+    return np.asarray(jax.jit(lambda *values: leap.plan(*values))(planner(config), *inputs))
 
 
 THOROUGH = replace(SMALL, plan_samples=600, plan_iterations=30, prior_weight=0.0)
@@ -278,9 +279,7 @@ def test_updates_are_those_of_the_tdm_and_leave_the_autoencoder(kind):
     assert isinstance(after, leap.State)
     assert equal(after.vae, state.vae)
     assert not equal(after.critic, state.critic)
-    assert set(metrics) == {
-        f"{group}" for group in ("critic/loss", "critic/q", "critic/target")
-    } | {"policy/loss", "policy/saturation"}
+    assert {name.split("/")[0] for name in metrics} == {"critic", "policy"}
     if kind == "states":
         expected, _ = eqx.filter_jit(tdm.update)(state, batch, KEY)
         assert equal(after, expected)
@@ -300,9 +299,8 @@ def test_pretraining_teaches_the_autoencoder_alone():
         after, metrics = one_round(after, states, jax.random.key(number))
         distances.append(float(metrics["vae/held_out_distance"]))
     assert distances[-1] < 0.4 < distances[0]
-    assert metrics["vae/loss"] == pytest.approx(
-        metrics["vae/error"] + 1e-3 * metrics["vae/kl"], rel=1e-4
-    )
+    expected = metrics["vae/error"] + 1e-3 * metrics["vae/kl"]
+    np.testing.assert_allclose(metrics["vae/loss"], expected, rtol=1e-4)
     others = set(vars(state)) - {"vae", "vae_optimizer", "config", "spec", "encoder"}
     assert all(equal(getattr(state, name), getattr(after, name)) for name in others)
     np.testing.assert_allclose(after.vae.center, positions[:1_800].mean(0), rtol=1e-5)

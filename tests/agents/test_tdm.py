@@ -289,7 +289,11 @@ def toy_batch(key: jax.Array, size: int = 256) -> Batch:
 def test_a_point_that_has_four_steps_is_brought_as_near_as_it_can_come():
     spec = EnvSpec("toy", (2,), "float32", (2,), 2, 4, True, None, TASK)
     config = tdm.Config(
-        hidden=(64, 64), max_steps_left=3, reward_scale=1.0, target_update_rate=0.05
+        hidden=(64, 64),
+        max_steps_left=3,
+        reward_scale=1.0,
+        target_update_rate=0.05,
+        target_noise=0.05,  # the usual noise makes the best value smaller by 0.1 m
     )
 
     @jax.jit
