@@ -1,0 +1,185 @@
+"""The stage before training: states, networks on disk, reuse; and agents that remember, whole."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+import midway
+from midway.agents import leap, sac, tdm
+from midway.training import pretrain
+from midway.training.evaluate import run_episodes
+from midway.training.folder import RunFolder
+from midway.training.progress import Silent
+from midway.types import ConfigurationError, NonFiniteError, Pretraining
+
+TINY: dict[str, Any] = {
+    "hidden": (8, 8),
+    "batch_size": 16,
+    "num_envs": 4,
+    "random_steps": 40,
+    "updates_per_step": 0.5,
+    "replay_capacity": 2_000,
+    "evaluate_every": 200,
+    "evaluation_episodes": 2,
+    "log_every": 100,
+    "checkpoint_every": 100,
+    "steps": 200,
+    "num_subgoals": 3,
+    "vae_states": 300,
+    "vae_rounds": 3,
+    "vae_updates": 10,
+    "plan_samples": 16,
+    "plan_iterations": 2,
+}
+TDM = {name: value for name, value in TINY.items() if name in vars(tdm.Config())} | {
+    name: TINY[name] for name in TINY if not name.startswith(("vae", "plan", "num_subgoals"))
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("leap") / "run"
+    assert midway.train("point-u", agent="leap", seed=5, out=path, changes=TINY).finished
+    return path
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def same_numbers(first: Path, second: Path, without: tuple[str, ...]) -> bool:
+    pairs = zip(rows(first), rows(second), strict=True)
+    return all(
+        {k: a[k] for k in a if k not in without} == {k: b[k] for k in b if k not in without}
+        for a, b in pairs
+    )
+
+
+# --- states ---------------------------------------------------------------------------------------
+
+
+def test_states_are_those_of_resets_and_of_random_steps() -> None:
+    env = midway.make_vec("point-u", num_envs=50)
+    at_rest = pretrain.sample_states(env, Pretraining(("vae",), 120, 0, 1), 1)
+    assert at_rest.observation.shape == at_rest.achieved_goal.shape == (120, 4)
+    np.testing.assert_array_equal(at_rest.observation[:, 2:], 0)
+    moved = pretrain.sample_states(env, Pretraining(("vae",), 200, 1, 1), 1)
+    speeds = np.abs(np.asarray(moved.observation)[:, 2:]).sum(1)
+    np.testing.assert_array_equal(speeds[:50], 0)  # resets and steps take turns
+    assert (speeds[50:100] > 0).mean() > 0.9
+    np.testing.assert_array_equal(speeds[100:150], 0)
+    assert len(np.unique(moved.observation, axis=0)) == 200
+    assert env.maze.free(np.asarray(at_rest.observation)[:, :2]).all()
+
+
+def test_same_seed_same_states() -> None:
+    env = midway.make_vec("point-u", num_envs=20)
+    settings = Pretraining(("vae",), 60, 2, 1)
+    first, again, other = (pretrain.sample_states(env, settings, s).observation for s in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+# --- what is written and read ---------------------------------------------------------------------
+
+
+def test_losses_and_networks_are_written(run: Path) -> None:
+    table = rows(run / "pretraining.csv")
+    assert [row["step"] for row in table] == ["1", "2", "3"]
+    assert float(table[-1]["vae/loss"]) < float(table[0]["vae/loss"])
+    arrays = load_file(run / "pretrained.safetensors")
+    assert {name.split(".")[0] for name in arrays} == {"vae"}
+    saved = load_file(run / "policy.safetensors")
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(array, saved[name])  # training leaves it alone
+
+
+def test_the_autoencoder_of_another_run_can_be_taken(run: Path, tmp_path: Path) -> None:
+    changes = TINY | {"vae_source": str(run)}
+    other = midway.train("point-u", agent="leap", seed=6, out=tmp_path / "run", changes=changes)
+    first, second = (load_file(p / "pretrained.safetensors") for p in (run, other.path))
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+    assert not (other.path / "pretraining.csv").exists()
+
+
+def test_a_source_that_does_not_fit_is_refused(run: Path, tmp_path: Path) -> None:
+    changes = TINY | {"vae_source": str(tmp_path)}
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        midway.train("point-u", agent="leap", out=tmp_path / "missing", changes=changes)
+    changes = TINY | {"vae_source": str(run), "latent_size": 3}
+    with pytest.raises(ConfigurationError, match=r"vae\.encoder"):
+        midway.train("point-u", agent="leap", out=tmp_path / "other-size", changes=changes)
+
+
+def test_agents_without_the_stage_are_left_as_they_are(tmp_path: Path) -> None:
+    state = object()
+    folder = RunFolder(tmp_path)
+
+    def no_env(num_envs: int, task: str) -> Any:
+        raise AssertionError("no environment is needed")
+
+    assert pretrain.run(sac, state, no_env, 0, folder, Silent()) == (state, 0.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_loss_that_is_not_finite_ends_the_stage(tmp_path: Path) -> None:
+    env = midway.make_vec("point-u", num_envs=20)
+    config = leap.Config(
+        hidden=(8,), vae_states=100, vae_rounds=4, vae_updates=5, vae_learning_rate=float("nan")
+    )
+    state = leap.create(config, env.goal_spec, jax.random.key(0))
+    with pytest.raises(NonFiniteError, match=r"became nan in round 1 of pre-training"):
+        pretrain.run(leap, state, lambda n, t: env, 0, RunFolder(tmp_path), Silent())
+
+
+# --- whole runs of agents that remember -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("agent", ["tdm", "leap"])
+def test_interrupted_and_resumed_equals_uninterrupted(agent: str, tmp_path: Path) -> None:
+    """What agents remember of running episodes is in the checkpoint."""
+    changes = TINY if agent == "leap" else TDM
+    whole = midway.train("point-u", agent=agent, seed=5, out=tmp_path / "whole", changes=changes)
+    half = {**changes, "steps": 100}
+    stopped = midway.train("point-u", agent=agent, seed=5, out=tmp_path / "half", changes=half)
+    resumed = midway.resume(stopped.path, steps=200)
+    weights = [(r.path / "policy.safetensors").read_bytes() for r in (whole, resumed)]
+    assert weights[0] == weights[1]
+    times = ("seconds", "training_seconds")
+    assert same_numbers(whole.path / "metrics.csv", resumed.path / "metrics.csv", times)
+
+
+def test_loaded_policies_plan(run: Path) -> None:
+    policy = midway.load(run)
+    env = midway.make_vec("point-u", num_envs=2)
+    observation, _ = env.reset(seed=1)
+    pair = observation["observation"], observation["desired_goal"]
+    actor = policy.actor()
+    # Both plan, with other draws: these networks are hardly trained, their plans are alike.
+    np.testing.assert_allclose(actor(*pair), policy(*pair), atol=0.1)
+    plan = np.asarray(actor.memory.latents)
+    actor(*pair)
+    np.testing.assert_array_equal(actor.memory.latents, plan)  # the segment is not over
+    assert actor.memory.elapsed.tolist() == [2, 2]
+    actor.restart(np.array([True, False]))
+    assert actor.memory.elapsed.tolist() == [0, 2]
+    assert policy(pair[0][0], pair[1][0]).shape == (2,)
+
+
+def test_evaluation_plans_and_is_reproducible(run: Path) -> None:
+    result = midway.evaluate(run, episodes=3, task="uniform")
+    assert result == midway.evaluate(run, episodes=3, task="uniform")
+    assert len(result.episodes) == 3
+
+
+def test_time_is_remembered_through_an_episode(run: Path) -> None:
+    env = midway.make_vec("point-u", num_envs=2, task="hard")
+    actor = midway.load(run).actor()
+    run_episodes(env, actor, "hard", "mean", 0)
+    assert actor.memory.elapsed.tolist() == [env.goal_spec.max_episode_steps] * 2
