@@ -11,12 +11,15 @@ import pytest
 
 from midway.envs.mazes import MAZES
 from midway.reports import compose, maps, report, study
+from midway.reports.curves import success_curve
 from midway.reports.difficulty import bins
 from midway.reports.health import PANELS, with_speed
 from midway.reports.imagined import density, halvings
+from midway.reports.rollouts import Recording
+from midway.reports.runs import groups
 from midway.reports.study import Episode, Study
 
-FIGURES = {"learning-curves", "ris-map", "difficulty", "ris-subgoals", "values", "health"}
+FIGURES = {"learning-curves", "ris-map", "difficulty", "ris-subgoals", "ris-values", "health"}
 
 
 class Page(HTMLParser):
@@ -91,7 +94,7 @@ def test_several_agents_and_seeds_and_a_run_in_progress(ris_run, sac_run, copy_r
     (runs[1] / "policy.safetensors").unlink()
     page, *figures = report([*runs, runs[0]], tmp_path / "out")
     names = {figure.stem.removeprefix("point-u-") for figure in figures}
-    assert names == FIGURES | {"sac-map"}
+    assert names == FIGURES - {"ris-values"} | {"sac-map", "ris-sac-values"}
     words = "".join(Page(page).words)
     assert "RIS, seed 1: unfinished, 800 of 1,200 steps" in words
     assert "RIS, seed 1: no policy saved yet" in words
@@ -186,6 +189,31 @@ def test_updates_per_second():
     table = {"updates": np.array([10.0, 30.0, 60.0]), "training_seconds": np.array([5.0, 9.0, 9.0])}
     assert with_speed(table)["updates/s"][1] == 5
     assert np.isnan(with_speed(table)["updates/s"][[0, 2]]).all()
+
+
+def test_over_time_a_seed_that_is_done_keeps_its_last_success(ris_run, copy_run):
+    runs = [compose.read(ris_run), compose.read(copy_run(ris_run, "b", seed=1))]
+    for number, run in enumerate(runs, start=1):
+        steps = len(run.evaluation["step"]) // 4
+        run.evaluation["success_rate"][:] = number / 4
+        run.evaluation["training_seconds"] = np.repeat(np.arange(1.0, steps + 1), 4) * 60 * number
+    (group,) = groups(runs)
+    drawn = success_curve(group, "hard", "mean", "minutes")
+    assert drawn is not None
+    assert (drawn.x[0], drawn.x[-1]) == (2, 6)
+    assert set(drawn.runs) == {2}
+    np.testing.assert_allclose(drawn.centre, 3 / 8)
+
+
+def test_an_ant_on_its_back_is_noticed():
+    state = np.zeros((2, 31), np.float32)
+    state[:, [5, 7]] = 1
+    upright = Recording("hard", state, state, state[0], False, 1.0)
+    state = state.copy()
+    state[-1, 7] = -1
+    fallen = Recording("hard", state, state, state[0], False, 1.0)
+    table = study._episode_table([upright, fallen], MAZES["u"])
+    assert table["flipped"].tolist() == [0, 1]
 
 
 def test_every_panel_says_what_is_healthy():

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from midway.envs.registry import ENVIRONMENTS
 from midway.reports import curves, difficulty, health, imagined, maps, page, style
 from midway.reports.page import Picture, Section
 from midway.reports.runs import Group, RunData, groups, read
@@ -44,7 +45,8 @@ def report(paths: Sequence[Path], out: Path | None = None) -> list[Path]:
 
 
 def _write(runs: Sequence[RunData], out: Path) -> list[Path]:
-    names = dict.fromkeys(run.config.env for run in runs)
+    known = list(ENVIRONMENTS)
+    names = sorted({run.config.env for run in runs}, key=known.index)
     by_env = {env: groups([run for run in runs if run.config.env == env]) for env in names}
     overview = Album(out)
     if len(by_env) > 1:
@@ -126,7 +128,7 @@ def _add_curves(album: Album, env: str, gathered: Sequence[Group]) -> None:
         "Success over environment steps (top) and over the time spent on collection and updates, "
         "without evaluations (bottom). Lines: one seed, or the interquartile mean of several; "
         "shaded: its 95 % bootstrap interval. Over time, seeds are compared along straight lines "
-        "between their evaluations.",
+        "between their evaluations, and a seed that is done keeps its last success.",
         f"Learning curves on {env}. Last success: "
         + "; ".join(
             f"{group.label} hard {page.success_text(group, 'hard')}, "
@@ -166,8 +168,9 @@ def _add_studies(album: Album, env: str, gathered: Sequence[Group]) -> None:
         if study.imagines:
             _add_subgoals(album, env, group, study)
     judged = {label: study for label, (_, study) in firsts.items() if study.judges}
-    if judged:
-        _add_values(album, env, judged)
+    for unit in dict.fromkeys(study.value_unit for study in judged.values()):
+        alike = {label: study for label, study in judged.items() if study.value_unit == unit}
+        _add_values(album, env, unit, alike)
 
 
 def _studies(group: Group, album: Album) -> list[Study]:
@@ -203,9 +206,21 @@ def _add_map(album: Album, env: str, group: Group, study: Study) -> None:
         f"{group.label} in the maze",
         f"Ways of mean actions ({_seed(study)}). Walls are grey; an episode ends within 0.5 m of "
         "its goal."
-        + (" The subgoals are drawn by the subgoal policy at a start." if study.imagines else ""),
+        + (" The subgoals are drawn by the subgoal policy at a start." if study.imagines else "")
+        + _flips(env, study),
         f"Map of {env} with the ways of {group.label}; success over all recorded episodes: "
         f"hard {rates['hard']}, uniform {rates['uniform']}.",
+    )
+
+
+def _flips(env: str, study: Study) -> str:
+    """Return how often the ant lies on its back at the end."""
+    if not env.startswith("ant-"):
+        return ""
+    flipped = [episode.flipped for episode in study.episodes()]
+    return (
+        f" The ant ends on its back in {page.percent(sum(flipped) / len(flipped))} of "
+        f"{len(flipped)} recorded episodes."
     )
 
 
@@ -249,15 +264,14 @@ def _add_subgoals(album: Album, env: str, group: Group, study: Study) -> None:
     )
 
 
-def _add_values(album: Album, env: str, judged: dict[str, Study]) -> None:
-    configs = [study.run.config.hyperparameters for study in judged.values()]
-    bound = max(1 / (1 - config.discount) for config in configs)
+def _add_values(album: Album, env: str, unit: str, studies: dict[str, Study]) -> None:
+    agents = dict.fromkeys(study.run.config.agent for study in studies.values())
     album.add(
-        f"{env}-values",
-        lambda: imagined.draw_values(judged, bound),
-        "Value of a goal",
-        "Value of every place for the goal of the hard task, from which the agent starts at rest: "
-        "minus the discounted steps that it expects to need. Bright: near by its own reckoning; "
-        "a sound value follows the corridors, not the straight line.",
-        f"Map of the values of {', '.join(judged)} on {env}.",
+        f"{env}-{'-'.join(agents)}-values",
+        lambda: imagined.draw_values(studies, unit),
+        f"Value of a goal: {', '.join(studies)}",
+        "Value of every place for the goal of the hard task, from which the agent starts at rest. "
+        "Bright: near by its own reckoning; a sound value follows the corridors, not the straight "
+        "line.",
+        f"Map of {unit} for {', '.join(studies)} on {env}.",
     )

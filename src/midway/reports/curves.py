@@ -1,7 +1,7 @@
 """Learning curves: success over environment steps and over training time."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,6 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from midway.reports import style
 from midway.reports.runs import Group, Table
 from midway.reports.statistics import Curve, Run, curve
+
+Column: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
 
 TASKS = {"hard": "hard task", "uniform": "uniform tasks"}
 LINES = {"mean": "-", "sampled": (0, (2, 1.5))}
@@ -92,23 +94,40 @@ def thousands(value: float | int, position: object = None) -> str:
 
 
 def success_curve(group: Group, task: str, actions: str, clock: str) -> Curve | None:
-    """Return success along ``step`` or ``minutes``; None before the first evaluation."""
+    """Return success along ``step`` or ``minutes``; None before the first evaluation.
+
+    Over minutes seeds differ in speed: the curve begins when all have been evaluated, and a seed
+    that is done keeps its last success.
+    """
     series = _series(group, task, actions, clock)
     if not series:
         return None
     places = np.unique(np.concatenate([x for x, _ in series]))
     if clock != "step" and len(series) > 1:
-        places = np.linspace(places[0], places[-1], TIME_POINTS)
+        places = np.linspace(max(x[0] for x, _ in series), places[-1], TIME_POINTS)
     return curve([series], places)
 
 
 def _series(group: Group, task: str, actions: str, clock: str) -> list[Run]:
     """Return success of every run that has been evaluated."""
-    tables = [run.evaluated(task, actions) for run in group.runs]
-    return [(_clock(t, clock), t["success_rate"]) for t in tables if t and len(t["step"])]
+    tables = [(run, run.evaluated(task, actions)) for run in group.runs]
+    series = [
+        (run, _clock(table, clock), table["success_rate"])
+        for run, table in tables
+        if table and len(table["step"])
+    ]
+    last = max((x[-1] for _, x, _ in series), default=0.0)
+    return [
+        _kept(x, y, last) if run.finished and clock != "step" else (x, y) for run, x, y in series
+    ]
 
 
-def _clock(table: Table, clock: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _kept(x: Column, y: Column, last: float) -> Run:
+    """Return a run that keeps its last success until ``last``."""
+    return np.append(x, max(last, x[-1])), np.append(y, y[-1])
+
+
+def _clock(table: Table, clock: str) -> Column:
     return table["step"] if clock == "step" else table["training_seconds"] / 60
 
 

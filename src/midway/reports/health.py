@@ -50,13 +50,13 @@ PANELS = (
     Panel(
         "Critic loss",
         ("critic/loss",),
-        "Drops, then stays level; lasting growth means divergence.",
+        "Settles at some level, which may be above its first; growth without end means divergence.",
         True,
     ),
     Panel(
         "KL to the prior (nats)",
         ("policy/kl_to_prior",),
-        "Rises while the policy learns, then stays small; growing without end: prior ignored.",
+        "Rises while the policy learns, then settles; growth without end: the prior is ignored.",
     ),
     Panel(
         "Subgoal advantage (steps)",
@@ -66,7 +66,7 @@ PANELS = (
     Panel(
         "Subgoal scale",
         ("subgoal/scale",),
-        "Falls, then levels off above 0: subgoals get precise but do not collapse.",
+        "Falls at first and settles above 0: subgoals get precise but do not collapse.",
     ),
     Panel(
         "Effective candidates",
@@ -77,7 +77,7 @@ PANELS = (
     Panel(
         "Policy entropy (nats)",
         ("policy/entropy",),
-        "Falls slowly, then levels off (SAC: at its target); a sudden fall: too sure too soon.",
+        "Settles (SAC: at its target); a sudden fall far below: too sure too soon.",
     ),
     Panel(
         "Entropy coefficient",

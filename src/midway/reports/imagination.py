@@ -22,6 +22,23 @@ def judges(agent: str) -> bool:
     return hasattr(registry.get(agent), "value") or agent == "sac"
 
 
+def plan(policy: Policy, memory: Any) -> Array | None:
+    """Return the planned subgoals ``(B, N, G)`` of an agent that plans (LEAP), else None.
+
+    Args:
+        policy: The policy.
+        memory: What it remembers of the running episodes.
+    """
+    if not hasattr(policy.agent, "subgoal_codes"):
+        return None
+    return np.asarray(_plan(policy.agent, policy.state, memory))
+
+
+@eqx.filter_jit
+def _plan(agent: Any, state: Any, memory: Any) -> Any:
+    return agent.subgoal_codes(state, memory.latents).achieved_goal
+
+
 def distribution(policy: Policy, observation: Array, goal: Array) -> tuple[Array, Array]:
     """Return location and scale of the subgoals for each pair, as achieved goals ``(B, G)``."""
     location, scale = _distribution(policy.state, observation, goal)

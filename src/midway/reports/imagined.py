@@ -111,10 +111,10 @@ def _legend() -> list[Line2D]:
     ]
 
 
-def draw_values(studies: Mapping[str, Study], bound: float) -> Figure:
+def draw_values(studies: Mapping[str, Study], unit: str) -> Figure:
     """Draw the value of the hard task's goal from everywhere in the maze, one map per label."""
     tables = {label: study.values() for label, study in studies.items()}
-    lowest = max(-bound, min(float(table["value"].min()) for table in tables.values()))
+    lowest = min(float(table["value"].min()) for table in tables.values())
     maze = next(iter(studies.values())).maze
     figure, axes = maps.panels(maze, len(studies), side=1.2)
     x, y = grid(maze)
@@ -128,7 +128,7 @@ def draw_values(studies: Mapping[str, Study], bound: float) -> Figure:
         maps.draw_ends(panel, start, goal)
         style.caption(panel, label, f"step {thousands(study.run.policy_step)}")
     bar = figure.colorbar(image, ax=axes, shrink=0.8, fraction=0.06)
-    bar.set_label("value of a state for this goal", fontsize=style.TEXT, color=style.INK)
+    bar.set_label(unit, fontsize=style.TEXT, color=style.INK)
     bar.ax.tick_params(labelsize=style.SMALL)
     bar.outline.set_visible(False)
     style.legend_below(figure, maps.ends_legend())

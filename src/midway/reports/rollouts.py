@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from midway.envs import registry as environments
+from midway.reports import imagination
 from midway.training.policy import Policy
 
 Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
@@ -23,6 +24,7 @@ class Recording:
         goal: The desired goal.
         success: Whether the goal was reached.
         final_distance: Distance to the goal at the end (m).
+        plans: Subgoals that the agent followed ``(T, N, ...)``, where it plans any.
     """
 
     task: str
@@ -31,6 +33,7 @@ class Recording:
     goal: Array
     success: bool
     final_distance: float
+    plans: Array | None = None
 
     @property
     def length(self) -> int:
@@ -52,9 +55,12 @@ def record(policy: Policy, episodes: Mapping[str, int], seed: int) -> list[Recor
     goals = observation["desired_goal"].copy()
     states = [{name: observation[name].copy() for name in ("observation", "achieved_goal")}]
     actor = policy.actor()
+    plans: list[Array] = []
     ends: dict[int, tuple[int, bool, float]] = {}
     while len(ends) < len(tasks):
         action = actor(observation["observation"], observation["desired_goal"])
+        plan = imagination.plan(policy, actor.memory)
+        plans += [] if plan is None else [plan]
         observation, _, terminated, truncated, info = env.step(action)
         states.append({name: observation[name].copy() for name in states[0]})
         ended = terminated | truncated
@@ -73,6 +79,7 @@ def record(policy: Policy, episodes: Mapping[str, int], seed: int) -> list[Recor
             goals[copy],
             success,
             distance,
+            np.stack([plan[copy] for plan in plans[: length - 1]]) if plans else None,
         )
         for copy, task in enumerate(tasks)
         for length, success, distance in [ends[copy]]

@@ -24,7 +24,7 @@ from midway.types import ConfigurationError
 SEED = 20_210_718
 """Seed of starts and goals in figures: the same for every run, and met in no training."""
 
-VERSION = 1
+VERSION = 2
 """Counted up when the same policy would give other tables."""
 
 STEPS = 30_000
@@ -35,6 +35,9 @@ PATH_POINTS = 100
 
 POSITION = slice(0, 2)
 """x and y in the observations and goals of every maze (m)."""
+
+COSINES = (5, 7)
+"""Cosines of pitch and roll in the observation of the ant; up points along their product."""
 
 CHAIN_DEPTH = 3
 MOMENTS = 4
@@ -54,6 +57,7 @@ class Episode:
         goal: Position of the goal (m).
         success: Whether the goal was reached.
         geodesic: Length of the shortest path from start to goal (m).
+        flipped: Whether an ant lay on its back at the end.
     """
 
     task: str
@@ -61,6 +65,7 @@ class Episode:
     goal: Float[np.ndarray, "2"]
     success: bool
     geodesic: float
+    flipped: bool = False
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,13 @@ class Study:
         """The saved policy."""
         return self._policy_of(self.run.folder.policy_weights)
 
+    @property
+    def value_unit(self) -> str:
+        """What the values of this agent are."""
+        if hasattr(self.run.config.hyperparameters, "discount"):
+            return "value: minus discounted steps to the goal"
+        return "value: minus distance left at the horizon"
+
     def episodes(self) -> list[Episode]:
         """Return episodes of every task with mean actions."""
         recordings: list[Recording] = []
@@ -137,6 +149,7 @@ class Study:
                 goal=np.array([table["goal_x"][i], table["goal_y"][i]]),
                 success=bool(table["success"][i]),
                 geodesic=float(table["geodesic"][i]),
+                flipped=bool(table["flipped"][i]),
             )
             for i in range(len(table["task"]))
         ]
@@ -243,7 +256,14 @@ def _episode_table(recordings: list[Recording], maze: Maze) -> Table:
         "success": np.array([int(r.success) for r in recordings]),
         "length": np.array([r.length for r in recordings]),
         "final_distance": np.array([r.final_distance for r in recordings]),
+        "flipped": np.array([int(_is_flipped(r)) for r in recordings]),
     }
+
+
+def _is_flipped(recording: Recording) -> bool:
+    """Return whether the torso's up axis points down; the point has none."""
+    last = recording.observations[-1]
+    return len(last) > max(COSINES) and float(np.prod(last[list(COSINES)])) < 0
 
 
 def _path_table(recordings: list[Recording]) -> Table:

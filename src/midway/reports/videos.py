@@ -198,6 +198,9 @@ class MazeScene:
 
 def _imagined(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I 2"] | None:
     """Return positions of the subgoals in every state (m); None if the agent has none."""
+    if recording.plans is not None:
+        last = recording.plans[-1:]
+        return np.concatenate([recording.plans, last])[..., POSITION]
     if not imagination.imagines(policy.config.agent):
         return None
     goals = np.repeat(recording.goal[None], len(recording.observations), axis=0)
