@@ -166,6 +166,12 @@ LEAP_QUICK_POINT: dict[str, Any] = {  # [leap.md]
 QUICK_HYPERPARAMETERS: dict[tuple[str, str], dict[str, Any]] = {
     ("point", "ris"): {"subgoal_learning_rate": 1e-3},  # [curves] fewer updates than the paper
     ("any", "leap"): LEAP_QUICK,
+    ("push", "leap"): {
+        "vae_states": 10_000,
+        "vae_rounds": 30,
+        "plan_samples": 300,
+        "plan_iterations": 10,
+    },
     ("point", "tdm"): LEAP_QUICK_POINT,
     ("point", "leap"): LEAP_QUICK_POINT,
 }
@@ -175,6 +181,7 @@ QUICK_LOOPS: dict[tuple[str, str], dict[str, Any]] = {
     ("any", "tdm"): {"relabel": LEAP_LOOP["relabel"]},
     ("any", "leap"): {"relabel": LEAP_LOOP["relabel"], "evaluate_every": 16_000},
     ("ant", "leap"): {"evaluate_every": 75_000},
+    ("push", "leap"): {"evaluation_episodes": 30},  # [LEAP]
     ("point", "leap"): {"evaluate_every": 8_000},
 }
 """What ``quick`` changes in the loop, by family of environments and agent."""

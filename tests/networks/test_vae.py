@@ -98,16 +98,39 @@ def test_image_layers_have_the_sizes_of_the_appendix():
     model = vae.ImageVAE(16, key=KEY)
     images = jnp.zeros((2, *IMAGE))
     sizes = [images.shape[1:]]
-    for convolution in model.convolutions:
-        images = convolution(images)
+    for layer in model.encoder:
+        images = layer.reduce(images)
         sizes.append(images.shape[1:])
     assert sizes == [(84, 84, 3), (27, 27, 16), (8, 8, 16), (2, 2, 32)]
-    for deconvolution in model.deconvolutions:
-        images = deconvolution(images)
+    for layer in model.decoder:
+        images = layer.enlarge(images)
         sizes.append(images.shape[1:])
     assert sizes[4:] == [(8, 8, 32), (27, 27, 16), (84, 84, 3)]
-    assert [c.weight.shape[0] for c in model.convolutions] == [5, 5, 5]
-    assert [c.weight.shape[0] for c in model.deconvolutions] == [5, 6, 6]
+    assert [layer.weight.shape[0] for layer in model.encoder] == [5, 5, 5]
+    assert [layer.weight.shape[0] for layer in model.decoder] == [5, 6, 6]
+
+
+@pytest.mark.parametrize(("kernel", "stride"), [(5, 3), (6, 3), (4, 2), (3, 1)])
+def test_enlarging_is_the_transpose_of_reducing(kernel, stride):
+    """<reduce(x), y> = <x, enlarge(y)> with the channels exchanged, biases left out."""
+    there = vae.Filter(kernel, stride, 2, 3, key=KEY)
+    back = vae.Filter(kernel, stride, 3, 2, key=KEY)
+    there = eqx.tree_at(lambda f: f.bias, there, jnp.zeros(3))
+    weight = there.weight.swapaxes(2, 3)
+    back = eqx.tree_at(lambda f: (f.weight, f.bias), back, (weight, jnp.zeros(2)))
+    small = jax.random.normal(KEY, (2, 4, 5, 3))
+    enlarged = back.enlarge(small)
+    assert enlarged.shape == (2, 3 * stride + kernel, 4 * stride + kernel, 2)
+    large = jax.random.normal(jax.random.key(1), enlarged.shape)
+    products = (there.reduce(large) * small).sum(), (large * enlarged).sum()
+    np.testing.assert_allclose(*products, rtol=1e-4)
+
+
+def test_images_are_decoded_in_blocks_without_a_trace():
+    model = vae.ImageVAE(4, key=KEY)
+    latent = jax.random.normal(KEY, (vae.BLOCK + 3, 4))
+    one_by_one = jnp.concatenate([model.decode(row[None]) for row in latent])
+    np.testing.assert_allclose(model.decode(latent), one_by_one, atol=1e-5)
 
 
 def test_image_values_may_be_bytes_or_shares():
