@@ -160,16 +160,17 @@ def success_text(group: Group, task: str, actions: str = "mean") -> str:
 
 def percent(share: float) -> str:
     """Return a share as a percentage without decimals."""
-    return f"{100 * share:.0f} %"
+    return f"{100 * share:.0f}\N{NO-BREAK SPACE}%"
 
 
 def _provenance(group: Group) -> str:
     """Return commands, versions and configuration of a group, folded."""
     commands = "\n".join(dict.fromkeys(_command(run) for run in group.runs))
     first = group.runs[0]
-    seeds = ", ".join(str(run.config.seed) for run in group.runs)
+    seeds = f"seed{'s' * (len(group.runs) > 1)} "
+    seeds += ", ".join(str(run.config.seed) for run in group.runs)
     return (
-        f"<details><summary>{html.escape(group.label)}, seeds {seeds}</summary>\n"
+        f"<details><summary>{html.escape(group.label)}, {seeds}</summary>\n"
         f"<p>Commands, as they were typed:</p>\n<pre>{html.escape(commands)}</pre>\n"
         f"{_facts(group)}\n<p>Configuration of seed {first.config.seed}:</p>\n"
         f"<pre>{html.escape(_configuration(first))}</pre>\n</details>"
