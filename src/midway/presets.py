@@ -159,7 +159,7 @@ LEAP_QUICK_POINT: dict[str, Any] = {  # [leap.md]
     "hidden": (128, 128),
     "target_update_rate": 0.02,
     "vae_states": 5_000,
-    "vae_rounds": 30,
+    "vae_rounds": 100,
     "plan_samples": 256,
     "plan_iterations": 15,
 }

@@ -11,6 +11,7 @@ from safetensors.numpy import load_file
 
 import midway
 from midway.agents import leap, sac, tdm
+from midway.reports import reconstructions, runs
 from midway.training import pretrain
 from midway.training.evaluate import run_episodes
 from midway.training.folder import RunFolder
@@ -136,6 +137,16 @@ def test_a_loss_that_is_not_finite_ends_the_stage(tmp_path: Path) -> None:
     state = leap.create(config, env.goal_spec, jax.random.key(0))
     with pytest.raises(NonFiniteError, match=r"became nan in round 1 of pre-training"):
         pretrain.run(leap, state, lambda n, t: env, 0, RunFolder(tmp_path), Silent())
+
+
+def test_what_the_autoencoder_keeps_is_drawn(run: Path) -> None:
+    data = runs.read(run)
+    assert reconstructions.has_autoencoder(data)
+    states, decoded = reconstructions.reconstruct(data)
+    assert states.shape == decoded.shape == (reconstructions.COUNT, 4)
+    figure = reconstructions.draw(data, "leap")
+    error = np.linalg.norm((states - decoded)[:, :2], axis=1).mean()
+    assert f"mean error {error:.2f} m" in figure.axes[0].get_title().replace("\n", " ")
 
 
 # --- whole runs of agents that remember -----------------------------------------------------------

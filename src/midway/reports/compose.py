@@ -7,7 +7,16 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from midway.envs.registry import ENVIRONMENTS
-from midway.reports import curves, difficulty, health, imagined, maps, page, style
+from midway.reports import (
+    curves,
+    difficulty,
+    health,
+    imagined,
+    maps,
+    page,
+    reconstructions,
+    style,
+)
 from midway.reports.page import Picture, Section
 from midway.reports.runs import Group, RunData, groups, read
 from midway.reports.study import Study, maze_of
@@ -100,8 +109,23 @@ def _chapter(env: str, gathered: Sequence[Group], out: Path) -> tuple[Section, l
         album.missing.append(f"{env} has no maze: no maps, difficulty or values")
     else:
         _add_studies(album, env, gathered)
+    _add_reconstructions(album, env, gathered)
     _add_health(album, env, gathered)
     return Section(env, gathered, album.pictures, album.missing), album.files
+
+
+def _add_reconstructions(album: Album, env: str, gathered: Sequence[Group]) -> None:
+    """Draw what autoencoders keep of states."""
+    for group in gathered:
+        for run in list(filter(reconstructions.has_autoencoder, group.runs))[:1]:
+            album.add(
+                f"{env}-{group.slug}-reconstructions",
+                lambda run=run, group=group: reconstructions.draw(run, group.label),  # type: ignore[misc]
+                f"What the autoencoder of {group.label} keeps",
+                "New states of the environment, and what is decoded from their latent numbers: "
+                f"{group.label} plans its subgoals in these (seed {run.config.seed}).",
+                f"States of {env} and their reconstructions.",
+            )
 
 
 def _unfinished(gathered: Sequence[Group]) -> Iterator[str]:
