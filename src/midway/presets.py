@@ -156,7 +156,7 @@ QUICK["point-omega"] = replace(QUICK["point"], steps=48_000)  # [curves] the lon
 
 LEAP_QUICK = {"vae_rounds": 300, "plan_samples": 1_000, "plan_iterations": 20}  # [leap.md]
 LEAP_QUICK_POINT: dict[str, Any] = {  # [leap.md]
-    "hidden": (128, 128),
+    "hidden": (256, 256),
     "target_update_rate": 0.02,
     "vae_states": 5_000,
     "vae_rounds": 100,
