@@ -16,7 +16,7 @@ from midway import functional
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
 from midway.networks.critics import TwinCritic
-from midway.networks.encoder import StateEncoder
+from midway.networks.encoder import Encoder
 from midway.networks.mlp import Precision
 from midway.networks.policies import GaussianPolicy, SubgoalPolicy
 from midway.types import Batch, EnvSpec, Metrics, Subgoal
@@ -63,7 +63,7 @@ class Config:
 class State(eqx.Module):
     """Networks, their Polyak copies and their optimisers."""
 
-    encoder: StateEncoder
+    encoder: Encoder
     critic: TwinCritic
     target_critic: TwinCritic
     subgoal_policy: SubgoalPolicy
@@ -99,6 +99,18 @@ def as_vector(spec: EnvSpec, subgoal: Subgoal) -> Float[Array, "*B S"]:
     return jnp.concatenate(subgoal, axis=-1)
 
 
+def subgoal_candidates(spec: EnvSpec, batch: Batch, code: Float[Array, "B S"]) -> Subgoal:
+    """Return the states drawn from replay as candidates (eq. 17); of images, their codes.
+
+    For images these are the codes of the batch's own observations, each beside another transition:
+    they are as uniform draws from replay as any, and need no further pass through the encoder.
+    """
+    if not spec.is_image:
+        return batch.subgoal_candidate
+    shifted = jnp.roll(code, 1, axis=0)
+    return Subgoal(shifted, shifted)
+
+
 # --- losses ---------------------------------------------------------------------------------------
 
 
@@ -111,7 +123,7 @@ def critic_target(state: State, batch: Batch, noise: Float[Array, "B A"]) -> Flo
 
 
 def critic_loss(
-    networks: tuple[TwinCritic, StateEncoder],
+    networks: tuple[TwinCritic, Encoder],
     observation: Shaped[Array, "B ..."],
     batch: Batch,
     target: Float[Array, " B"],
@@ -201,33 +213,14 @@ def policy_loss(
 def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
     """Return the state after one gradient step of every network, and scalars to log."""
     encoding_key, target_key, subgoal_key, action_key = jax.random.split(key, 4)
-    observation, batch = encode(state, batch, encoding_key)
+    observation, batch = encoders.encode_fixed(state.encoder, batch, encoding_key)
     state, code, critic_metrics = update_critic(state, observation, batch, target_key)
-    batch = batch._replace(observation=code)
+    batch = batch._replace(
+        observation=code, subgoal_candidate=subgoal_candidates(state.spec, batch, code)
+    )
     state, subgoal_metrics = update_subgoal_policy(state, batch)
     state, policy_metrics = update_policy(state, batch, subgoal_key, action_key)
     return update_copies(state), critic_metrics | subgoal_metrics | policy_metrics
-
-
-def encode(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[Shaped[Array, "B ..."], Batch]:
-    """Return the augmented observation, and the batch with everything else as fixed codes."""
-    keys = jax.random.split(key, 4)
-    encoder = state.encoder
-
-    def code(image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Float[Array, "B S"]:
-        return jax.lax.stop_gradient(encoder(encoder.augment(image, key)))
-
-    candidate_code = code(batch.subgoal_candidate.observation, keys[3])
-    candidate = Subgoal(
-        candidate_code,
-        candidate_code if state.spec.goal_is_observation else batch.subgoal_candidate.achieved_goal,
-    )
-    fixed = batch._replace(
-        next_observation=code(batch.next_observation, keys[1]),
-        goal=code(batch.goal, keys[2]),
-        subgoal_candidate=candidate,
-    )
-    return encoder.augment(batch.observation, keys[0]), fixed
 
 
 def update_critic(
@@ -323,7 +316,7 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     observation_size, goal_size = encoders.code_sizes(spec)
     subgoal_size = observation_size if spec.goal_is_observation else observation_size + goal_size
     pair = observation_size + goal_size
-    encoder = encoders.create(spec, encoder_key)
+    encoder = encoders.create(spec, config.precision, encoder_key)
     critic = TwinCritic(pair + spec.action_dim, config.hidden, config.precision, key=critic_key)
     subgoal_policy = SubgoalPolicy(
         pair, subgoal_size, config.hidden, config.precision, key=subgoal_key

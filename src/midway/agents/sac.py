@@ -17,7 +17,7 @@ from midway import functional
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
 from midway.networks.critics import TwinCritic
-from midway.networks.encoder import StateEncoder
+from midway.networks.encoder import Encoder
 from midway.networks.mlp import Precision
 from midway.networks.policies import Gaussian, GaussianPolicy
 from midway.types import Batch, EnvSpec, Metrics
@@ -51,7 +51,7 @@ class Config:
 class State(eqx.Module):
     """Networks, the logarithm of the entropy coefficient, and their optimisers."""
 
-    encoder: StateEncoder
+    encoder: Encoder
     critic: TwinCritic
     target_critic: TwinCritic
     policy: GaussianPolicy
@@ -90,7 +90,7 @@ def critic_target(state: State, batch: Batch, noise: Float[Array, "B A"]) -> Flo
 
 
 def critic_loss(
-    networks: tuple[TwinCritic, StateEncoder],
+    networks: tuple[TwinCritic, Encoder],
     observation: Shaped[Array, "B ..."],
     batch: Batch,
     target: Float[Array, " B"],
@@ -127,27 +127,13 @@ def entropy_loss(
 def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
     """Return the state after one gradient step of every network, and scalars to log."""
     encoding_key, target_key, action_key = jax.random.split(key, 3)
-    observation, batch = encode(state, batch, encoding_key)
+    observation, batch = encoders.encode_fixed(state.encoder, batch, encoding_key)
     state, code, critic_metrics = update_critic(state, observation, batch, target_key)
     state, policy_metrics = update_policy(state, batch._replace(observation=code), action_key)
     target_critic = functional.polyak_update(
         state.critic, state.target_critic, state.config.target_update_rate
     )
     return replace(state, target_critic=target_critic), critic_metrics | policy_metrics
-
-
-def encode(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[Shaped[Array, "B ..."], Batch]:
-    """Return the augmented observation, and the batch with next observation and goal as codes."""
-    keys = jax.random.split(key, 3)
-    encoder = state.encoder
-
-    def code(image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Float[Array, "B S"]:
-        return jax.lax.stop_gradient(encoder(encoder.augment(image, key)))
-
-    fixed = batch._replace(
-        next_observation=code(batch.next_observation, keys[1]), goal=code(batch.goal, keys[2])
-    )
-    return encoder.augment(batch.observation, keys[0]), fixed
 
 
 def update_critic(
@@ -223,7 +209,7 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     """Return networks at their random start; the target critics equal the critics."""
     encoder_key, critic_key, policy_key = jax.random.split(key, 3)
     pair = sum(encoders.code_sizes(spec))
-    encoder = encoders.create(spec, encoder_key)
+    encoder = encoders.create(spec, config.precision, encoder_key)
     critic = TwinCritic(pair + spec.action_dim, config.hidden, config.precision, key=critic_key)
     policy = GaussianPolicy(pair, spec.action_dim, config.hidden, config.precision, key=policy_key)
     log_entropy_coefficient = jnp.zeros(())

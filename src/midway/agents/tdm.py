@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, Key, Shaped
 from midway import functional
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
-from midway.networks.encoder import StateEncoder
+from midway.networks.encoder import Encoder
 from midway.networks.initialization import with_small_output
 from midway.networks.mlp import MLP, Precision
 from midway.types import Batch, ConfigurationError, EnvSpec, Metrics
@@ -72,7 +72,7 @@ class Config:
 class State(eqx.Module):
     """Networks, their Polyak copies, their optimisers and the number of updates."""
 
-    encoder: StateEncoder
+    encoder: Encoder
     critic: tuple[MLP, MLP]
     target_critic: tuple[MLP, MLP]
     policy: MLP
@@ -138,7 +138,7 @@ def critic_target(
 
 
 def critic_loss(
-    networks: tuple[tuple[MLP, MLP], StateEncoder],
+    networks: tuple[tuple[MLP, MLP], Encoder],
     observation: Shaped[Array, "B ..."],
     batch: Batch,
     steps_left: Float[Array, "B 1"],
@@ -192,7 +192,7 @@ def update(state: AnyState, batch: Batch, key: Key[Array, ""]) -> tuple[AnyState
     """
     encoding_key, steps_key, noise_key = jax.random.split(key, 3)
     reward = reward_vector(state.config, batch)
-    observation, batch = encode(state, batch, encoding_key)
+    observation, batch = encoders.encode_fixed(state.encoder, batch, encoding_key)
     steps_left = draw_steps_left(state.config, len(batch.action), steps_key)
     noise = jax.random.normal(noise_key, batch.action.shape)
     target = critic_target(state, batch, reward, steps_left, noise)
@@ -210,20 +210,6 @@ def update(state: AnyState, batch: Batch, key: Key[Array, ""]) -> tuple[AnyState
 def draw_steps_left(config: Config, count: int, key: Key[Array, ""]) -> Float[Array, "B 1"]:
     """Return numbers of steps left, uniform from 0 to the horizon, both included."""
     return jax.random.randint(key, (count, 1), 0, config.max_steps_left + 1).astype(jnp.float32)
-
-
-def encode(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[Shaped[Array, "B ..."], Batch]:
-    """Return the augmented observation, and the batch with next observation and goal as codes."""
-    keys = jax.random.split(key, 3)
-    encoder = state.encoder
-
-    def code(image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Float[Array, "B S"]:
-        return jax.lax.stop_gradient(encoder(encoder.augment(image, key)))
-
-    fixed = batch._replace(
-        next_observation=code(batch.next_observation, keys[1]), goal=code(batch.goal, keys[2])
-    )
-    return encoder.augment(batch.observation, keys[0]), fixed
 
 
 def update_critic(
@@ -329,7 +315,7 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
         new = MLP(in_size, config.hidden, out_size, config.precision, key=key)
         return with_small_output(new, OUTPUT_BOUND)
 
-    encoder = encoders.create(spec, encoder_key)
+    encoder = encoders.create(spec, config.precision, encoder_key)
     critic_inputs = inputs + spec.action_dim
     first, second = (network(critic_inputs, num_rewards, k) for k in (first_key, second_key))
     critic = (first, second)

@@ -10,6 +10,9 @@ from jaxtyping import Array, BFloat16, Float, Key
 
 Precision: TypeAlias = Literal["f32", "bf16"]
 
+DTYPES = {"f32": jnp.float32, "bf16": jnp.bfloat16}
+"""What the inputs of products are rounded to."""
+
 
 def fastest_precision() -> Precision:
     """Return ``bf16`` where products of bfloat16 have instructions of their own, else ``f32``.

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, Shaped
 
+from midway.networks.convolution import BLOCK, Filter
 from midway.networks.initialization import with_small_output
 from midway.networks.mlp import MLP, Linear
 from midway.types import EnvSpec, Metrics
@@ -25,9 +26,6 @@ ENCODER_LAYERS = ((5, 3, 16), (5, 3, 16), (5, 3, 32))
 DECODER_LAYERS = ((5, 3, 32), (6, 3, 16), (6, 3, 3))
 """The same for 2 -> 8 -> 27 -> 84 pixels; the appendix lists the input channels 32, 32, 16."""
 SMALLEST_MAP = (2, 2, 32)
-
-BLOCK = 16
-"""Images that are decoded at once."""
 
 
 class Latent(NamedTuple):
@@ -91,54 +89,6 @@ class StateVAE(eqx.Module):
         parts = (states.mean(0), scale)
         vae: StateVAE = eqx.tree_at(lambda v: (v.center, v.scale), self, parts)
         return vae
-
-
-class Filter(eqx.Module):
-    """Weights of a convolution or of its transpose; images are ``(B, height, width, channels)``."""
-
-    weight: Float[Array, "K K I O"]
-    bias: Float[Array, " O"]
-    stride: int = eqx.field(static=True)
-
-    def __init__(
-        self, kernel: int, stride: int, in_channels: int, out_channels: int, *, key: Key[Array, ""]
-    ) -> None:
-        # Uniform in ±1/√(number of weights of one output), like `Linear`.
-        bound = (in_channels * kernel**2) ** -0.5
-        weight_key, bias_key = jax.random.split(key)
-        shape = (kernel, kernel, in_channels, out_channels)
-        self.weight = jax.random.uniform(weight_key, shape, minval=-bound, maxval=bound)
-        self.bias = jax.random.uniform(bias_key, (out_channels,), minval=-bound, maxval=bound)
-        self.stride = stride
-
-    def reduce(self, image: Float[Array, "B H W I"]) -> Float[Array, "B H2 W2 O"]:
-        """Return the convolution without padding."""
-        strides, layout = (self.stride, self.stride), ("NHWC", "HWIO", "NHWC")
-        filtered = jax.lax.conv_general_dilated(
-            image, self.weight, strides, "VALID", dimension_numbers=layout
-        )
-        return filtered + self.bias
-
-    def enlarge(self, image: Float[Array, "B H W I"]) -> Float[Array, "B H2 W2 O"]:
-        """Return the transposed convolution: every pixel adds a patch, one stride from the next.
-
-        Computed as one product and a sum of shifted tiles as large as the stride: half of what
-        XLA's own takes on processors, with the gradient.
-        """
-        (batch, height, width, _), (kernel, _, channels, out) = image.shape, self.weight.shape
-        stride, tiles = self.stride, -(-kernel // self.stride)
-        to_tiles = [(0, tiles * stride - kernel)] * 2 + [(0, 0)] * 2
-        weight = jnp.pad(self.weight, to_tiles).transpose(2, 0, 1, 3).reshape(channels, -1)
-        patches = (image @ weight).reshape(batch, height, width, tiles, stride, tiles, stride, out)
-        total = jnp.zeros(())
-        for row in range(tiles):
-            for column in range(tiles):
-                tile = patches[:, :, :, row, :, column].swapaxes(2, 3)
-                tile = tile.reshape(batch, height * stride, width * stride, out)
-                shift = [(i * stride, (tiles - 1 - i) * stride) for i in (row, column)]
-                total = total + jnp.pad(tile, [(0, 0), *shift, (0, 0)])
-        size = [(side - 1) * stride + kernel for side in (height, width)]
-        return total[:, : size[0], : size[1]] + self.bias
 
 
 class ImageVAE(eqx.Module):

@@ -1,0 +1,110 @@
+"""Encoders: sizes and start of appendix B, translation, and what the codes depend on."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from midway.networks import encoder as encoders
+from midway.networks.encoder import CODE_SIZE, MARGIN
+from midway.types import Batch, DistanceTask, EnvSpec, Subgoal
+
+KEY = jax.random.key(0)
+IMAGE = (84, 84, 3)
+TASK = DistanceTask(((0, 1),), 0.5)
+IMAGES = EnvSpec("images", IMAGE, "uint8", IMAGE, 2, 50, True, (4,), TASK)
+STATES = EnvSpec("states", (5,), "float32", (2,), 2, 50, False, None, TASK)
+
+
+def pictures(count, seed=0):
+    return jnp.asarray(np.random.default_rng(seed).integers(0, 256, (count, *IMAGE), np.uint8))
+
+
+@pytest.fixture(scope="module")
+def encoder():
+    return encoders.create(IMAGES, "f32", KEY)
+
+
+def test_layers_are_those_of_the_appendix(encoder):
+    shapes = [layer.weight.shape for layer in encoder.convolutions]
+    assert shapes == [(3, 3, 3, 32), *[(3, 3, 32, 32)] * 3]
+    assert [layer.stride for layer in encoder.convolutions] == [2, 2, 2, 1]
+    assert encoder.linear.weight.shape == (7 * 7 * 32, CODE_SIZE)
+    assert encoders.code_sizes(IMAGES) == (16, 16)
+    assert encoders.code_sizes(STATES) == (5, 2)
+
+
+def test_start_is_orthogonal_in_the_centre(encoder):
+    for layer in encoder.convolutions:
+        tap = layer.weight[1, 1]
+        assert jnp.count_nonzero(layer.weight) == tap.size
+        smaller = tap @ tap.T if tap.shape[0] < tap.shape[1] else tap.T @ tap
+        np.testing.assert_allclose(smaller, 2 * jnp.eye(len(smaller)), atol=1e-5)
+        assert not layer.bias.any()
+    product = encoder.linear.weight.T @ encoder.linear.weight
+    np.testing.assert_allclose(product, jnp.eye(CODE_SIZE), atol=1e-5)
+
+
+def test_codes_by_the_start_of_the_network(encoder):
+    """With centre taps alone, the code sees one pixel for each of the 7 x 7 places."""
+    images = pictures(2)
+    places = [1 + 2 * (1 + 2 * (1 + 2 * (1 + i))) for i in range(7)]
+    x = np.asarray(images, np.float64)[:, places][:, :, places] / 255
+    for layer in encoder.convolutions:
+        x = np.maximum(x @ np.asarray(layer.weight[1, 1], np.float64), 0)
+    expected = x.reshape(2, -1) @ np.asarray(encoder.linear.weight, np.float64)
+    np.testing.assert_allclose(encoder(images), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_an_image_has_one_code_in_any_batch(encoder):
+    images = pictures(19)
+    np.testing.assert_allclose(encoder(images)[17:], encoder(images[17:]), rtol=1e-4, atol=1e-5)
+
+
+def test_translation_moves_each_image_by_the_offset_drawn_for_it(encoder):
+    images = pictures(32)
+    moved = encoder.augment(images, KEY)
+    assert moved.shape == images.shape
+    assert moved.dtype == jnp.uint8
+    corners = np.asarray(jax.random.randint(KEY, (32, 2), 0, 2 * MARGIN + 1))
+    assert corners.min() == 0
+    assert corners.max() == 2 * MARGIN
+    framed = np.pad(images, ((0, 0), (8, 8), (8, 8), (0, 0)))
+    for image, frame, (row, column) in zip(moved, framed, corners, strict=True):
+        np.testing.assert_array_equal(image, frame[row : row + 84, column : column + 84])
+    assert (encoder.augment(images, jax.random.key(1)) != moved).any()
+
+
+def test_states_are_their_own_codes():
+    encoder = encoders.create(STATES, "f32", KEY)
+    states = jax.random.normal(KEY, (3, 5))
+    np.testing.assert_array_equal(encoder(encoder.augment(states, KEY)), states)
+
+
+def batch_of_pictures():
+    images = pictures(4, 1)
+    return Batch(
+        observation=images,
+        action=jnp.zeros((4, 2)),
+        reward=-jnp.ones(4),
+        terminated=jnp.zeros(4, bool),
+        next_observation=pictures(4, 2),
+        goal=pictures(4, 3),
+        subgoal_candidate=Subgoal(images, images),
+    )
+
+
+def test_fixed_codes_have_no_gradient_and_the_observation_stays_an_image(encoder):
+    batch = batch_of_pictures()
+    observation, fixed = encoders.encode_fixed(encoder, batch, KEY)
+    assert observation.shape == (4, *IMAGE)
+    assert observation.dtype == jnp.uint8
+    assert fixed.next_observation.shape == fixed.goal.shape == (4, CODE_SIZE)
+
+    @eqx.filter_grad
+    def gradient(encoder):
+        codes = encoders.encode_fixed(encoder, batch, KEY)[1]
+        return (codes.goal**2 + codes.next_observation**2).sum()
+
+    assert not any(leaf.any() for leaf in jax.tree.leaves(gradient(encoder)))
