@@ -42,22 +42,30 @@ class DistanceTask:
         groups: Indices of the coordinates of each Euclidean distance, such as ``((0, 1),)`` for
             the x-y position of an ant or ``((0, 1), (2, 3))`` for hand and puck.
         threshold: Largest distance, not included, that counts as success (m).
+        names: What each group is, such as ``("hand", "puck")``, where they are told apart.
     """
 
     groups: tuple[tuple[int, ...], ...]
     threshold: float
+    names: tuple[str, ...] = ()
 
     def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
         """Return the largest of the groups' distances ``(B,)`` (m)."""
+        largest, *others = self._distances(achieved, desired)
+        for other in others:
+            largest = largest * (largest >= other) + other * (other > largest)
+        return largest
+
+    def named_distances(self, achieved: ArrayLike, desired: ArrayLike) -> dict[str, ArrayLike]:
+        """Return the distance of each group ``(B,)`` by its name (m); nothing without names."""
+        return dict(zip(self.names, self._distances(achieved, desired), strict=False))
+
+    def _distances(self, achieved: ArrayLike, desired: ArrayLike) -> list[ArrayLike]:
         difference = achieved - desired
-        distances = [
+        return [
             sum(difference[..., i] ** 2 for i in group) ** 0.5  # type: ignore[operator]
             for group in self.groups
         ]
-        largest = distances[0]
-        for other in distances[1:]:
-            largest = largest * (largest >= other) + other * (other > largest)
-        return largest
 
     def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
         """Return reward ``(B,)``, always -1, and terminated ``(B,)``."""

@@ -4,6 +4,8 @@ Every number of the model is that of the original environment.
 """
 
 import math
+from collections.abc import Mapping
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -12,7 +14,7 @@ from jaxtyping import Float, Float32
 
 from midway.envs.maze_env import MazeVectorEnv, walls_mjcf
 from midway.envs.mazes import MAZES, Maze
-from midway.envs.vector import Array
+from midway.envs.vector import Array, Observations
 
 TIMESTEP = 0.03
 """Seconds of one simulation step."""
@@ -138,6 +140,7 @@ class AntMazeVectorEnv(MazeVectorEnv):
     """
 
     body_radius = TORSO_RADIUS
+    logged_info: ClassVar[Mapping[str, str]] = {"flipped": "flip_rate"}
 
     def __init__(
         self, maze: str, num_envs: int = 1, task: str = "uniform", num_threads: int = 0
@@ -167,3 +170,8 @@ class AntMazeVectorEnv(MazeVectorEnv):
     ) -> Float32[Array, "n 31"]:
         parts = [qpos[:, :3], encode_rotation(qpos[:, 3:7]), qpos[:, 7:], qvel]
         return np.concatenate(parts, axis=1, dtype=np.float32)
+
+    def _own_info(self) -> Observations:
+        _, x, y, _ = self._qpos[:, 3:7].T
+        # The height of the torso's up axis, which is cos pitch * cos roll.
+        return {"flipped": 1 - 2 * (x * x + y * y) < 0}

@@ -52,7 +52,7 @@ STATE_SPEC = EnvSpec(
     max_episode_steps=100,
     goal_is_observation=True,
     state_shape=None,
-    task=DistanceTask(groups=((0, 1), (2, 3)), threshold=GOAL_THRESHOLD),
+    task=DistanceTask(((0, 1), (2, 3)), GOAL_THRESHOLD, names=("hand", "puck")),
 )
 
 IMAGE_SPEC = replace(

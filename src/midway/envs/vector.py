@@ -1,7 +1,7 @@
 """The vector environment with goals: everything but the simulation itself."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Int, Shaped, UInt64
 
-from midway.types import ConfigurationError, EnvSpec
+from midway.types import ConfigurationError, DistanceTask, EnvSpec
 
 Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
 Observations: TypeAlias = dict[str, Array]
@@ -46,6 +46,8 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
     """Whether ``load_state_dict`` continues in the middle of the episodes."""
     option_names: tuple[str, ...] = ("reset_mask", "task")
     """What ``options`` of ``reset`` may hold."""
+    logged_info: ClassVar[Mapping[str, str]] = {}
+    """Info whose mean over the steps of collection is logged, as ``collect/`` and the name here."""
     single_observation_space: spaces.Dict
 
     def __init__(
@@ -140,7 +142,8 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
         Returns:
             Observations, reward float32, terminated (the goal is reached) and truncated (the
             episode is at its limit), both of which can be true at once, and info: ``distance``
-            to the goal, ``is_success``, ``elapsed_steps``.
+            to the goal, ``is_success``, ``elapsed_steps``; ``distance_hand`` and so on where
+            the task names several distances; others are the environment's own.
 
         Raises:
             ResetNeeded: An episode has ended or never begun (Gymnasium's own vector environments
@@ -210,8 +213,16 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
             "distance": self.goal_spec.task.distance(achieved, desired).astype(np.float64),
             "is_success": reached.copy(),
             "elapsed_steps": self._elapsed.copy(),
+            **self._own_info(),
         }
+        if isinstance(self.goal_spec.task, DistanceTask):
+            distances = self.goal_spec.task.named_distances(achieved, desired)
+            info |= {f"distance_{name}": d.astype(np.float64) for name, d in distances.items()}
         return info | {f"_{name}": mask.copy() for name in info}
+
+    def _own_info(self) -> dict[str, Array]:
+        """Return further info, ``(num_envs,)`` each, in newly allocated arrays."""
+        return {}
 
     def _checked_task(self, task: str) -> str:
         if task not in self.tasks:

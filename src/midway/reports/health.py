@@ -91,9 +91,9 @@ PANELS = (
         "Rises, with noise: sampled actions on the tasks of training.",
     ),
     Panel(
-        "Flips (share of episodes)",
+        "Steps on its back (share)",
         ("collect/flip_rate",),
-        "Falls towards 0 as the ant learns to walk.",
+        "Falls towards 0 as the ant learns to walk; level and high: replay fills with lying ants.",
     ),
     Panel(
         "Updates per second",

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -62,7 +63,11 @@ class RunData:
 
     @property
     def policy_step(self) -> int:
-        """The step that the policy was saved at, together with the newest checkpoint."""
+        """The step that the policy was saved at, or that of the newest checkpoint."""
+        with suppress(ConfigurationError):  # whoever loads the policy says what is wrong
+            step = read_json(self.folder.policy_config).get("step")
+            if isinstance(step, int):
+                return step
         folder = self.folder.checkpoints
         names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
         return max((int(name) for name in names if name.isdigit()), default=self.steps)

@@ -24,7 +24,9 @@ class Checkpoints:
         options = ocp.CheckpointManagerOptions(
             max_to_keep=KEPT, enable_async_checkpointing=False, create=True
         )
-        self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
+        self._manager = ocp.CheckpointManager(
+            folder.absolute(), options=options, item_handlers=ocp.StandardCheckpointHandler()
+        )
 
     def save(self, step: int, state: Any) -> None:
         """Write a state, a nested dictionary of arrays.
@@ -50,14 +52,22 @@ class Checkpoints:
         Raises:
             ConfigurationError: The checkpoint is damaged or belongs to another run.
         """
-        target = jax.tree.map(_abstract, like)
         try:
+            target = jax.tree.map(_abstract, self._stored(step, like))
             return self._manager.restore(step, args=ocp.args.StandardRestore(target))
         except (ValueError, KeyError, FileNotFoundError) as error:
             reason = str(error).splitlines()[0]
             raise ConfigurationError(
                 f"checkpoint of step {step} cannot be read: {reason}"
             ) from error
+
+    def _stored(self, step: int, like: Any) -> Any:
+        """Return ``like`` without the sums that checkpoints of earlier versions do not have."""
+        stored = self._manager.item_metadata(step) or {}
+        if "logged" in stored.get("collector", {}):
+            return like
+        kept = {name: part for name, part in like["collector"].items() if name != "logged"}
+        return {**like, "collector": kept}
 
     def close(self) -> None:
         """Free what the manager holds."""

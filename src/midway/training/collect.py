@@ -1,5 +1,6 @@
 """Collection: one step of every parallel environment into the replay."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,9 +23,9 @@ class EpisodeCounts:
     length: int = 0
 
     def metrics(self) -> dict[str, float]:
-        """Return means over the ended episodes; empty where none ended."""
+        """Return means over the ended episodes; NaN where none ended."""
         if self.episodes == 0:
-            return {}
+            return {"collect/success_rate": math.nan, "collect/episode_length": math.nan}
         return {
             "collect/success_rate": self.successes / self.episodes,
             "collect/episode_length": self.length / self.episodes,
@@ -39,13 +40,20 @@ class Collector:
         env: A vector environment without autoreset.
         observation: The newest observations of all copies.
         begun: Copies in which the last step was followed by a new episode.
-        counts: Episodes that ended since they were last reset.
+        counts: Episodes that ended since the last row of metrics.
+        logged: Sum and number over the steps since then of each info that the environment wants
+            logged, by its name in ``metrics.csv``.
     """
 
     env: Any
     observation: dict[str, Any]
     begun: np.ndarray[Any, np.dtype[np.bool_]]
     counts: EpisodeCounts = field(default_factory=EpisodeCounts)
+    logged: dict[str, np.ndarray[Any, np.dtype[np.float64]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Begin the sums that are not given."""
+        self.logged = {name: np.zeros(2) for name in self.env.logged_info.values()} | self.logged
 
     @staticmethod
     def start(env: Any, replay: ReplayState, seed: int) -> tuple["Collector", ReplayState]:
@@ -58,6 +66,8 @@ class Collector:
         """Take one step in every copy; begin new episodes where one has ended."""
         actions = choose(self.observation)
         self.observation, _, terminated, truncated, info = self.env.step(actions)
+        for name, column in self.env.logged_info.items():
+            self.logged[column] += (info[name].sum(), self.env.num_envs)
         everyone = np.ones(self.env.num_envs, np.bool_)
         replay = step.add(replay, actions, self.observation, everyone)
         ended = terminated | truncated
@@ -70,9 +80,21 @@ class Collector:
         self.begun = ended
         return replay
 
+    def take_metrics(self) -> dict[str, float]:
+        """Return means since the last call, NaN where there are none; then start anew."""
+        means = {
+            f"collect/{column}": total / steps if steps else math.nan
+            for column, (total, steps) in self.logged.items()
+        }
+        metrics = self.counts.metrics() | means
+        self.counts = EpisodeCounts()
+        self.logged = {column: np.zeros(2) for column in self.logged}
+        return metrics
+
     def state_dict(self) -> dict[str, Any]:
         """Return simulators, observations and counts as arrays."""
         return {
+            **({"logged": {k: v.copy() for k, v in self.logged.items()}} if self.logged else {}),
             "env": self.env.state_dict(),
             "observation": dict(self.observation),
             "counts": {name: np.array(value) for name, value in vars(self.counts).items()},
@@ -96,10 +118,11 @@ class Collector:
                 f"the checkpoint does not fit the environment: {error}"
             ) from error
         counts = EpisodeCounts(**{name: int(value) for name, value in state["counts"].items()})
+        logged = {name: np.array(value) for name, value in state.get("logged", {}).items()}
         everyone = np.ones(env.num_envs, np.bool_)
         if env.resumable:
-            return Collector(env, dict(state["observation"]), ~everyone, counts), replay
+            return Collector(env, dict(state["observation"]), ~everyone, counts, logged), replay
         observation, _ = env.reset()
-        return Collector(env, observation, everyone, counts), step.begin(
+        return Collector(env, observation, everyone, counts, logged), step.begin(
             replay, observation, everyone
         )

@@ -92,10 +92,12 @@ class Logger:
             "success_rate": result.success_rate,
             "final_distance": result.final_distance,
             "episode_length": result.length,
+            **{f"final_distance_{name}": d for name, d in result.final_distances.items()},
         }
         row = {"task": result.task, "actions": result.actions, "episodes": len(result.episodes)}
         row = {"step": step, **clock, **row, **values}
-        self._evaluation.write({column: row[column] for column in EVALUATION_COLUMNS})
+        columns = dict.fromkeys([*EVALUATION_COLUMNS, *values])
+        self._evaluation.write({column: row[column] for column in columns})
         for name, value in values.items():
             self._events.add_scalar(f"eval/{result.task}/{result.actions}/{name}", value, step)
 

@@ -138,9 +138,7 @@ class Training:
                 raise NonFiniteError(f"{name} became {value} before step {self.steps}")
         self.totals = jax.tree.map(lambda total: total * 0, self.totals)
         self.updates_logged = self.updates
-        values |= self.collector.counts.metrics()
-        self.collector.counts = type(self.collector.counts)()
-        return values
+        return values | self.collector.take_metrics()
 
     def evaluate(self) -> Iterator[Evaluation]:
         """Yield the evaluations of the current policy, on environments of their own."""
@@ -210,7 +208,7 @@ class Training:
             if not bool(np.isfinite(np.asarray(array)).all()):
                 raise NonFiniteError(f"{name} is not finite at step {self.steps}")
         checkpoints.save(self.steps, self.state_dict())
-        policies.save(self.folder, self.config, self.state)
+        policies.save(self.folder, self.config, self.state, self.steps)
 
 
 def run(training: Training, checkpoints: Checkpoints, logger: Logger, reporter: Reporter) -> bool:
@@ -263,8 +261,7 @@ def _log(training: Training, logger: Logger, reporter: Reporter, success: dict[s
     """Write one row of metrics where there were updates, and say how far the run is."""
     values = training.metrics()
     if values:
-        collected = {"collect/success_rate": np.nan, "collect/episode_length": np.nan}
-        logger.metrics(training.steps, {**_clock(training), **collected, **values})
+        logger.metrics(training.steps, {**_clock(training), **values})
     speed = training.steps / max(training.seconds, 1e-9)
     reporter.advance(training.steps, {"steps/s": speed, **success})
 

@@ -29,11 +29,13 @@ class Policy:
         agent: The agent's module.
         state: The agent's state with the saved networks; its optimisers are at their start.
         config: The run that trained it.
+        step: The environment step that it was saved at; None if its file does not say.
     """
 
     agent: ModuleType
     state: Any
     config: RunConfig
+    step: int | None = None
 
     def __call__(self, observation: Any, goal: Any) -> np.ndarray[Any, np.dtype[Any]]:
         """Return the tanh of the mean action, ``(action_dim,)`` or ``(B, action_dim)``.
@@ -85,12 +87,13 @@ def _networks(agent: ModuleType, state: Any) -> dict[str, Any]:
     return {name: eqx.filter(getattr(state, name), eqx.is_array) for name in agent.NETWORKS}
 
 
-def save(folder: RunFolder, config: RunConfig, state: Any) -> None:
+def save(folder: RunFolder, config: RunConfig, state: Any, steps: int) -> None:
     """Write ``policy.safetensors`` and ``policy.json``, each whole or not at all."""
     _save_weights(folder.policy_weights, config, state)
     spec = dataclasses.asdict(state.spec)
     del spec["task"]
-    write_json(folder.policy_config, {"format": FORMAT, **config.to_json(), "spec": spec})
+    description = {"format": FORMAT, "step": steps, **config.to_json(), "spec": spec}
+    write_json(folder.policy_config, description)
 
 
 def keep(folder: RunFolder, config: RunConfig, state: Any, steps: int) -> None:
@@ -116,7 +119,8 @@ def load(folder: RunFolder, spec: EnvSpec) -> Policy:
     Raises:
         ConfigurationError: The folder holds no policy, or a damaged or foreign one.
     """
-    config = RunConfig.from_json(read_json(folder.policy_config))
+    description = read_json(folder.policy_config)
+    config = RunConfig.from_json(description)
     agent = registry.get(config.agent)
     state = agent.create(config.hyperparameters, spec, jax.random.key(0))
     try:
@@ -125,4 +129,5 @@ def load(folder: RunFolder, spec: EnvSpec) -> Policy:
         raise ConfigurationError(f"{folder.policy_weights} cannot be read: {error}") from error
     networks = with_named_arrays(_networks(agent, state), arrays)
     loaded = {name: eqx.combine(networks[name], getattr(state, name)) for name in networks}
-    return Policy(agent, dataclasses.replace(state, **loaded), config)
+    step = description.get("step")
+    return Policy(agent, dataclasses.replace(state, **loaded), config, step)
