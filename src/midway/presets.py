@@ -85,6 +85,13 @@ LEAP_PAPER: dict[str, Any] = {
 }
 """LEAP, and TDM as far as it has these."""
 
+PUSH_PAPER: dict[str, Any] = {
+    "policy_learning_rate": 1e-4,  # [1]
+    "entropy_learning_rate": 1e-4,  # as the policy's
+    "epsilon": 1e-4,  # [1] ε
+}
+"""What differs on the arm and puck, for ``ris`` and ``sac``."""
+
 HYPERPARAMETERS = {"ris": RIS_PAPER, "sac": SAC_PAPER, "tdm": LEAP_PAPER, "leap": LEAP_PAPER}
 
 LEAP_TASKS: dict[str, dict[str, Any]] = {
@@ -124,6 +131,12 @@ PAPER_LOOPS: dict[str, dict[str, Any]] = {
 }
 """What differs in the loop by agent."""
 
+PUSH_LOOP: dict[str, Any] = {
+    "batch_size": 256,  # [1]
+    "replay_capacity": 102_000,  # [1] 100,000 transitions in episodes of 100
+}
+"""What differs in the loop on the arm and puck; [LEAP] has 2,048 and a million, on states."""
+
 QUICK = {
     "point": replace(
         PAPER,
@@ -151,6 +164,20 @@ QUICK = {
     ),
 }
 QUICK["point-omega"] = replace(QUICK["point"], steps=48_000)  # [curves] the longest way
+QUICK["push"] = replace(
+    PAPER,
+    steps=200_000,
+    num_envs=8,
+    random_steps=5_000,
+    updates_per_step=0.5,
+    batch_size=64,
+    replay_capacity=102_000,
+    evaluate_every=20_000,
+    evaluation_episodes=50,
+    log_every=2_000,
+    checkpoint_every=50_000,
+)
+QUICK["push-state"] = replace(QUICK["push"], updates_per_step=1.0, batch_size=256)
 """The loop by environment or family of environments; others take the point's."""
 
 LEAP_QUICK = {"vae_rounds": 300, "plan_samples": 1_000, "plan_iterations": 20}  # [leap.md]
@@ -201,10 +228,11 @@ def preset(env: str, agent: str, name: str) -> tuple[TrainConfig, Any]:
         raise ConfigurationError(f"unknown preset {name!r}: choose one of paper, quick")
     config, family = registry.get(agent).Config, env.partition("-")[0]
     values = HYPERPARAMETERS[agent]
-    if agent in ("tdm", "leap"):
-        values = values | LEAP_TASKS.get(family, {}) | LEAP_TASKS.get(env, {})
+    tasks = LEAP_TASKS if agent in ("tdm", "leap") else {"push": PUSH_PAPER}
+    values = values | tasks.get(family, {}) | tasks.get(env, {})
     if name == "paper":
-        return replace(PAPER, **PAPER_LOOPS.get(agent, {})), config(**_known(config, values))
+        loop = PAPER_LOOPS.get(agent, {}) | (PUSH_LOOP if family == "push" else {})
+        return replace(PAPER, **loop), config(**_known(config, values))
     train = QUICK.get(env) or QUICK.get(family, QUICK["point"])
     for key in (("any", agent), (family, agent)):
         train = replace(train, **QUICK_LOOPS.get(key, {}))

@@ -65,6 +65,16 @@ def test_paper_preset_is_table_1() -> None:
     assert (ris.kl_weight, ris.advantage_temperature, ris.num_subgoals) == (0.1, 0.1, 10)
 
 
+def test_paper_preset_of_the_arm_is_the_other_column_of_table_1() -> None:
+    train, ris = presets.preset("push", "ris", "paper")
+    assert (train.batch_size, train.updates_per_step) == (256, 1)
+    assert 100_000 <= train.replay_capacity * 100 / 102 < 101_000
+    rates = (ris.critic_learning_rate, ris.policy_learning_rate, ris.subgoal_learning_rate)
+    assert rates == (1e-3, 1e-4, 1e-4)
+    assert (ris.epsilon, ris.encoder_learning_rate) == (1e-4, 1e-4)
+    assert presets.preset("push", "sac", "paper")[1].policy_learning_rate == 1e-4
+
+
 def test_changes_take_text_and_keep_types() -> None:
     changes = {"batch_size": "32", "relabel": "(0.5, 0.25, 0.25)", "kl_weight": "1", "steps": 2e3}
     config = api.configure("point-u", changes=changes)

@@ -1,0 +1,80 @@
+"""Training from images: it runs, and a stopped and resumed run equals one never stopped."""
+
+import csv
+import signal
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import midway
+from drawing_here import needs_renderer
+from midway.envs.push import IMAGE_SPEC
+from midway.replay import buffer
+from midway.training import loop
+from midway.training.folder import RunFolder
+from midway.training.policy import load
+
+SMALL = {
+    "hidden": (8, 8),
+    "batch_size": 8,
+    "num_envs": 2,
+    "random_steps": 20,
+    "updates_per_step": 0.5,
+    "replay_capacity": 500,
+    "evaluate_every": 40,
+    "evaluation_episodes": 1,
+    "log_every": 10,
+    "checkpoint_every": 30,
+    "steps": 60,
+}
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return [
+            {name: value for name, value in row.items() if "seconds" not in name}
+            for row in csv.DictReader(file)
+        ]
+
+
+@needs_renderer
+def test_exact_resume_with_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = midway.train("push", seed=1, out=tmp_path / "whole", changes=SMALL)
+    advance = loop.Training.advance
+
+    def interrupted(training: loop.Training) -> None:
+        advance(training)
+        if training.steps == 44:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop.Training, "advance", interrupted)
+        run = midway.train("push", seed=1, out=tmp_path / "run", changes=SMALL)
+    assert not run.finished
+    assert midway.resume(run.path).finished
+    for name in ("metrics.csv", "evaluation.csv"):
+        assert rows(run.path / name) == rows(whole.path / name)
+        assert rows(run.path / name)
+    weights = [(r.path / "policy.safetensors").read_bytes() for r in (run, whole)]
+    assert weights[0] == weights[1]
+
+
+@needs_renderer
+def test_a_saved_policy_acts_on_images(tmp_path: Path) -> None:
+    run = midway.train("push", seed=1, out=tmp_path / "run", changes=SMALL | {"steps": 30})
+    policy = load(RunFolder(run.path).path)
+    observation, _ = midway.make_vec("push", num_envs=2).reset(seed=0)
+    actions = policy(observation["observation"], observation["desired_goal"])
+    assert np.asarray(actions).shape == (2, 2)
+    assert np.abs(actions).max() <= 1
+
+
+def test_a_hundred_thousand_transitions_keep_each_image_once() -> None:
+    held = buffer.memory_bytes(IMAGE_SPEC, capacity=102_000, num_lanes=8)
+    assert held < 2.3 * 2**30
+    assert held > 102_000 * 84 * 84 * 3
+    kinds = buffer.create(IMAGE_SPEC, 1_700, 8).rows
+    assert kinds["observation"].dtype == jnp.uint8
+    assert "achieved_goal" not in kinds
