@@ -6,11 +6,14 @@ import threading
 import time
 
 import numpy as np
-from drawing_here import needs_renderer
+import pytest
 
+from drawing_here import needs_renderer
 from midway.envs.push_scene import HAND_BOX, IMAGE_SIZE, PUCK_BOX, TASKS, push_model
 from midway.envs.registry import make_vec
 from midway.envs.rendering import BACKENDS, Renderer, backend, draw
+from midway.envs.single import SingleGoalEnv
+from midway.types import ConfigurationError
 
 
 def far_from(states):
@@ -254,3 +257,13 @@ def test_the_image_shows_all_of_the_workspace():
         ]
         seen = projected(np.array(corners))
         assert ((seen > 8) & (seen < IMAGE_SIZE - 8)).all()
+
+
+@needs_renderer
+def test_rewards_of_images_are_refused_and_of_their_states_given():
+    env = SingleGoalEnv("push")
+    observation, _ = env.reset(seed=0)
+    with pytest.raises(ConfigurationError, match="give achieved_state and desired_state"):
+        env.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})
+    states = observation["desired_state"], observation["desired_state"]
+    assert env.compute_terminated(*states, {})

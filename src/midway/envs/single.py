@@ -7,6 +7,7 @@ import numpy as np
 
 from midway.envs.registry import make_vec
 from midway.envs.vector import Array, Observations
+from midway.types import ConfigurationError
 
 
 class SingleGoalEnv(gymnasium.Env[Observations, Array]):
@@ -67,16 +68,31 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
         )
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Return the reward of goals ``(goal_dim,)`` or ``(n, goal_dim)``; info is not used."""
-        return self.goal_spec.task(achieved_goal, desired_goal)[0]
+        """Return the reward of goals ``(goal_dim,)`` or ``(n, goal_dim)``; info is not used.
+
+        Where goals are images, give ``achieved_state`` and ``desired_state`` in their place.
+
+        Raises:
+            ConfigurationError: Images, which do not tell how far apart they are.
+        """
+        return self._outcome(achieved_goal, desired_goal)[0]
 
     def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
-        """Return whether the goal is reached, for one or n goals; info is not used."""
-        return self.goal_spec.task(achieved_goal, desired_goal)[1]
+        """Return whether the goal is reached; goals and errors as of ``compute_reward``."""
+        return self._outcome(achieved_goal, desired_goal)[1]
 
     def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> bool:
         """Return whether ``info`` is of the last step that an episode may have."""
         return bool(info["elapsed_steps"] >= self.goal_spec.max_episode_steps)
+
+    def _outcome(self, achieved: Array, desired: Array) -> tuple[Any, Any]:
+        shape = self.goal_spec.state_shape
+        if shape is not None and np.shape(achieved)[-1:] + np.shape(desired)[-1:] != shape * 2:
+            raise ConfigurationError(
+                f"reward of {self.goal_spec.name}: images do not tell distances, "
+                "give achieved_state and desired_state"
+            )
+        return self.goal_spec.task(achieved, desired)
 
 
 def _first(observations: Observations) -> Observations:
