@@ -208,10 +208,10 @@ def test_over_time_a_seed_that_is_done_keeps_its_last_success(ris_run, copy_run)
 def test_an_ant_on_its_back_is_noticed():
     state = np.zeros((2, 31), np.float32)
     state[:, [5, 7]] = 1
-    upright = Recording("hard", state, state, state[0], False, 1.0)
+    upright = Recording("hard", state, state, state[0], state, state[0], False, 1.0)
     state = state.copy()
     state[-1, 7] = -1
-    fallen = Recording("hard", state, state, state[0], False, 1.0)
+    fallen = Recording("hard", state, state, state[0], state, state[0], False, 1.0)
     table = study._episode_table([upright, fallen], MAZES["u"])
     assert table["flipped"].tolist() == [0, 1]
 

@@ -130,6 +130,7 @@ def evaluate(
             }
         )
         return
+    named = ", ".join(f"{name} {d:.3f} m" for name, d in result.final_distances.items())
     print(
         f"{run}: {task}, {actions} actions: success {result.success_rate:.1%} of {episodes} "
         f"episodes, {result.length:.1f} steps, {result.final_distance:.2f} m from the goal"
@@ -203,8 +204,9 @@ def watch(
     task: str = "hard",
     episodes: Count = 1,
     seed: int = 0,
+    live: bool = False,
 ) -> None:
-    """Write a video of the policy with its imagined subgoals.
+    """Write a video of the policy with its imagined subgoals, or show it in a window.
 
     Args:
         run: Run folder.
@@ -212,9 +214,15 @@ def watch(
         task: hard, uniform, or a numbered case of the environment.
         episodes: Number of episodes.
         seed: Seed of starts and goals.
+        live: Show the episodes in a window instead; needs a display.
     """
     from midway import reports
 
+    if live:
+        if out is not None:
+            raise ConfigurationError(f"--out {out}: --live writes no file")
+        reports.show(run, task=task, episodes=episodes, seed=seed)
+        return
     print(reports.watch(run, out, task=task, episodes=episodes, seed=seed))
 
 

@@ -1,13 +1,11 @@
 """From run folders to files: the figures and the page."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-
-from matplotlib.figure import Figure
 
 from midway.envs.registry import ENVIRONMENTS
 from midway.reports import (
+    arm,
     curves,
     difficulty,
     health,
@@ -15,9 +13,10 @@ from midway.reports import (
     maps,
     page,
     reconstructions,
-    style,
+    tabletop,
 )
-from midway.reports.page import Picture, Section
+from midway.reports.album import Album
+from midway.reports.page import Section
 from midway.reports.runs import Group, RunData, groups, read
 from midway.reports.study import Study, maze_of
 from midway.types import ConfigurationError
@@ -74,41 +73,17 @@ def _write(runs: Sequence[RunData], out: Path) -> list[Path]:
     return [html, *overview.files, *(file for _, files in chapters for file in files)]
 
 
-@dataclass
-class Album:
-    """Figures on their way to files.
-
-    Attributes:
-        out: Where the files go.
-        pictures: What the page shows.
-        files: The files that were written.
-        missing: What could not be drawn, and why.
-    """
-
-    out: Path
-    pictures: list[Picture] = field(default_factory=list)
-    files: list[Path] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
-
-    def add(
-        self, name: str, draw: Callable[[], Figure], title: str, caption: str, description: str
-    ) -> None:
-        """Draw a figure and write its files."""
-        files = style.save(draw(), self.out / name)
-        self.files += files
-        self.pictures.append(Picture(files[0], title, caption, description))
-
-
 def _chapter(env: str, gathered: Sequence[Group], out: Path) -> tuple[Section, list[Path]]:
     """Draw everything about one environment."""
     album = Album(out)
     album.missing += _unfinished(gathered)
     _add_curves(album, env, gathered)
-    maze = maze_of(env)
-    if maze is None:
-        album.missing.append(f"{env} has no maze: no maps, difficulty or values")
-    else:
+    if maze_of(env) is not None:
         _add_studies(album, env, gathered)
+    elif tabletop.has_table(env):
+        arm.add(album, env, gathered)
+    else:
+        album.missing.append(f"{env} has no maze: no maps, difficulty or values")
     _add_reconstructions(album, env, gathered)
     _add_health(album, env, gathered)
     return Section(env, gathered, album.pictures, album.missing), album.files
@@ -231,6 +206,7 @@ def _add_map(album: Album, env: str, group: Group, study: Study) -> None:
         f"Ways of mean actions ({_seed(study)}). Walls are grey; an episode ends within 0.5 m of "
         "its goal."
         + (" The subgoals are drawn by the subgoal policy at a start." if study.imagines else "")
+        + (" The plan is that of an episode from the middle of the start." if study.plans else "")
         + _flips(env, study),
         f"Map of {env} with the ways of {group.label}; success over all recorded episodes: "
         f"hard {rates['hard']}, uniform {rates['uniform']}.",

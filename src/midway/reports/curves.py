@@ -19,6 +19,12 @@ TASKS = {"hard": "hard task", "uniform": "uniform tasks"}
 LINES = {"mean": "-", "sampled": (0, (2, 1.5))}
 """Solid lines for mean actions, dashed ones for sampled actions."""
 
+NAME_LINES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1)))
+"""Lines of several distances of one run."""
+
+DISTANCE = "final_distance_"
+"""How the columns of distances with names begin."""
+
 MARKS = 10
 """Marks on a long curve, about."""
 
@@ -99,7 +105,41 @@ def success_curve(group: Group, task: str, actions: str, clock: str) -> Curve | 
     Over minutes seeds differ in speed: the curve begins when all have been evaluated, and a seed
     that is done keeps its last success.
     """
-    series = _series(group, task, actions, clock)
+    return _curve(_series(group, task, actions, clock), clock)
+
+
+def distances(group: Group) -> list[str]:
+    """Return names of distances that evaluations of the group tell apart, such as ``hand``."""
+    columns = dict.fromkeys(name for run in group.runs for name in run.evaluation)
+    return [name.removeprefix(DISTANCE) for name in columns if name.startswith(DISTANCE)]
+
+
+def draw_distances(groups: Sequence[Group], threshold: float) -> Figure:
+    """Draw each named distance to the goal at the end of episodes, over steps, by task."""
+    names = list(dict.fromkeys(name for group in groups for name in distances(group)))
+    figure, axes = style.figure(1, len(TASKS), height=3.6, sharey=True)
+    for panel, (task, title) in zip(axes, TASKS.items(), strict=True):
+        for group in groups:
+            for name, line in zip(names, NAME_LINES, strict=False):
+                series = _series(group, task, "mean", "step", DISTANCE + name)
+                if (drawn := _curve(series, "step")) is not None:
+                    _draw_curve(panel, group, "mean", drawn, line)
+        panel.axhline(threshold, color=style.MUTED, linestyle=":", linewidth=1.4)
+        style.label(panel, f"Distance at the end, {title}", "environment steps", "m")
+        panel.set_ylim(bottom=0)
+        panel.set_xlim(left=0)
+        panel.xaxis.set_major_formatter(thousands)
+    lines = [
+        Line2D([], [], color=style.MUTED, linewidth=2, linestyle=line, label=name)
+        for name, line in zip(names, NAME_LINES, strict=False)
+    ]
+    near = Line2D([], [], color=style.MUTED, linestyle=":", label="near enough")
+    style.legend_below(figure, [*_group_entries(groups), *lines, near])
+    return figure
+
+
+def _curve(series: list[Run], clock: str) -> Curve | None:
+    """Return the curve of several runs; None if there are none."""
     if not series:
         return None
     places = np.unique(np.concatenate([x for x, _ in series]))
@@ -108,13 +148,15 @@ def success_curve(group: Group, task: str, actions: str, clock: str) -> Curve | 
     return curve([series], places)
 
 
-def _series(group: Group, task: str, actions: str, clock: str) -> list[Run]:
-    """Return success of every run that has been evaluated."""
+def _series(
+    group: Group, task: str, actions: str, clock: str, column: str = "success_rate"
+) -> list[Run]:
+    """Return success, or another column, of every run that has been evaluated."""
     tables = [(run, run.evaluated(task, actions)) for run in group.runs]
     series = [
-        (run, _clock(table, clock), table["success_rate"])
+        (run, _clock(table, clock), table[column])
         for run, table in tables
-        if table and len(table["step"])
+        if column in table and len(table["step"])
     ]
     last = max((x[-1] for _, x, _ in series), default=0.0)
     return [
@@ -137,13 +179,13 @@ def _draw_group(axes: Axes, group: Group, task: str, actions: str, clock: str) -
         _draw_curve(axes, group, actions, drawn)
 
 
-def _draw_curve(axes: Axes, group: Group, actions: str, drawn: Curve) -> None:
+def _draw_curve(axes: Axes, group: Group, actions: str, drawn: Curve, line: Any = None) -> None:
     """Draw the line; for mean actions also marks, and the interval of several runs."""
     axes.plot(
         drawn.x,
         drawn.centre,
         color=group.colour,
-        linestyle=LINES[actions],
+        linestyle=line or LINES[actions],
         linewidth=2,
         marker=group.marker if actions == "mean" else None,
         markersize=4,

@@ -17,6 +17,11 @@ def imagines(agent: str) -> bool:
     return "subgoal_policy" in registry.get(agent).NETWORKS
 
 
+def plans(agent: str) -> bool:
+    """Return whether the agent of this name plans subgoals as it acts (LEAP)."""
+    return hasattr(registry.get(agent), "subgoal_codes")
+
+
 def judges(agent: str) -> bool:
     """Return whether the agent of this name has a value of a state and a goal."""
     return hasattr(registry.get(agent), "value") or agent == "sac"
@@ -29,9 +34,24 @@ def plan(policy: Policy, memory: Any) -> Array | None:
         policy: The policy.
         memory: What it remembers of the running episodes.
     """
-    if not hasattr(policy.agent, "subgoal_codes"):
+    if not plans(policy.config.agent):
         return None
     return np.asarray(_plan(policy.agent, policy.state, memory))
+
+
+def first_plan(policy: Policy, observation: Array, goal: Array) -> Array:
+    """Return the subgoals ``(N, G)`` planned between a state and a goal, as an episode begins.
+
+    Args:
+        policy: A policy that plans.
+        observation: The state ``(...)``.
+        goal: The goal ``(...)``.
+    """
+    actor = policy.actor()
+    actor(observation[None], goal[None])
+    found = plan(policy, actor.memory)
+    assert found is not None
+    return np.asarray(found[0])
 
 
 @eqx.filter_jit

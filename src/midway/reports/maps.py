@@ -78,7 +78,11 @@ def draw(study: Study, label: str) -> Figure:
             draw_path(panel, episode)
     if study.imagines:
         scatter_subgoals(axes[0], sample(study))
-    style.legend_below(figure, _legend(study.imagines))
+    if study.plans:
+        plan = study.plan()
+        draw_plan(axes[0], np.stack([plan["x"], plan["y"]], axis=1))
+    imagined = "imagined" if study.imagines else "planned" if study.plans else ""
+    style.legend_below(figure, _legend(imagined))
     return figure
 
 
@@ -112,6 +116,14 @@ def scatter_subgoals(axes: Axes, positions: Float[np.ndarray, "n 2"]) -> None:
     )
 
 
+def draw_plan(axes: Axes, way: Float[np.ndarray, "N 2"]) -> None:
+    """Draw planned subgoals in their order, on a line from the start to the goal (m)."""
+    axes.plot(*way.T, color=SUBGOAL, linewidth=1.5, zorder=5)
+    look: dict[str, Any] = {"color": SUBGOAL, "markersize": 7, "markeredgecolor": style.INK}
+    axes.plot(*way[1:-1].T, "D", zorder=6, **look)
+    draw_ends(axes, way[0], way[-1])
+
+
 def ends_legend() -> list[Line2D]:
     """Return the entries of start and goal."""
     return [
@@ -120,13 +132,14 @@ def ends_legend() -> list[Line2D]:
     ]
 
 
-def _legend(subgoals: bool) -> list[Line2D]:
+def _legend(subgoals: str) -> list[Line2D]:
+    """Return the entries; ``subgoals`` are imagined, planned, or none."""
     entries = [
         Line2D([], [], color=REACHED, label="reaches the goal"),
         Line2D([], [], color=FAILED, linestyle=DASHES, label="does not"),
         *ends_legend(),
     ]
     if subgoals:
-        name = "subgoals imagined at the start"
+        name = f"subgoals {subgoals} at the start"
         entries.append(Line2D([], [], color=SUBGOAL, marker="D", linestyle="", label=name))
     return entries

@@ -22,6 +22,9 @@ class Recording:
         observations: ``(T + 1, ...)``, from the start to the last state.
         achieved: Achieved goals ``(T + 1, ...)``.
         goal: The desired goal.
+        states: What success is measured on ``(T + 1, ...)``: the achieved goals, or the true states
+            where these are images.
+        target: What the states have to come near.
         success: Whether the goal was reached.
         final_distance: Distance to the goal at the end (m).
         plans: Subgoals that the agent followed ``(T, N, ...)``, where it plans any.
@@ -31,6 +34,8 @@ class Recording:
     observations: Array
     achieved: Array
     goal: Array
+    states: Array
+    target: Array
     success: bool
     final_distance: float
     plans: Array | None = None
@@ -52,8 +57,8 @@ def record(policy: Policy, episodes: Mapping[str, int], seed: int) -> list[Recor
     tasks = np.repeat(list(episodes), list(episodes.values()))
     env = environments.make_vec(policy.config.env, num_envs=len(tasks))
     observation = _reset(env, tasks, seed)
-    goals = observation["desired_goal"].copy()
-    states = [{name: observation[name].copy() for name in ("observation", "achieved_goal")}]
+    goals, targets = observation["desired_goal"].copy(), env.success_pair(observation)[1].copy()
+    steps = [_copied(env, observation)]
     actor = policy.actor()
     plans: list[Array] = []
     ends: dict[int, tuple[int, bool, float]] = {}
@@ -62,10 +67,10 @@ def record(policy: Policy, episodes: Mapping[str, int], seed: int) -> list[Recor
         plan = imagination.plan(policy, actor.memory)
         plans += [] if plan is None else [plan]
         observation, _, terminated, truncated, info = env.step(action)
-        states.append({name: observation[name].copy() for name in states[0]})
+        steps.append(_copied(env, observation))
         ended = terminated | truncated
         for copy in np.flatnonzero(ended):
-            end = (len(states), bool(terminated[copy]), float(info["distance"][copy]))
+            end = (len(steps), bool(terminated[copy]), float(info["distance"][copy]))
             ends.setdefault(int(copy), end)
         if ended.any():
             # Copies that are done go round again, unrecorded, until the last one has ended.
@@ -73,17 +78,25 @@ def record(policy: Policy, episodes: Mapping[str, int], seed: int) -> list[Recor
             actor.restart(ended)
     return [
         Recording(
-            str(task),
-            np.stack([state["observation"][copy] for state in states[:length]]),
-            np.stack([state["achieved_goal"][copy] for state in states[:length]]),
-            goals[copy],
-            success,
-            distance,
-            np.stack([plan[copy] for plan in plans[: length - 1]]) if plans else None,
+            task=str(task),
+            **{name: np.stack([step[name][copy] for step in steps[:length]]) for name in steps[0]},
+            goal=goals[copy],
+            target=targets[copy],
+            success=success,
+            final_distance=distance,
+            plans=np.stack([plan[copy] for plan in plans[: length - 1]]) if plans else None,
         )
         for copy, task in enumerate(tasks)
         for length, success, distance in [ends[copy]]
     ]
+
+
+def _copied(env: Any, observation: dict[str, Array]) -> dict[str, Array]:
+    """Return what a recording holds of each step, by its names there."""
+    states = env.success_pair(observation)[0]
+    parts = (observation["observation"], observation["achieved_goal"], states)
+    names = ("observations", "achieved", "states")
+    return {name: part.copy() for name, part in zip(names, parts, strict=True)}
 
 
 def _reset(env: Any, tasks: Array, seed: int) -> dict[str, Array]:

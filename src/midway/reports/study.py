@@ -113,6 +113,11 @@ class Study:
         return imagination.imagines(self.run.config.agent)
 
     @property
+    def plans(self) -> bool:
+        """Whether the agent plans subgoals."""
+        return imagination.plans(self.run.config.agent)
+
+    @property
     def judges(self) -> bool:
         """Whether the agent has a value of a state and a goal."""
         return imagination.judges(self.run.config.agent)
@@ -178,6 +183,17 @@ class Study:
             return {"x": way[:, 0].astype(np.float64), "y": way[:, 1].astype(np.float64)}
 
         return self._table("chain", compute)
+
+    def plan(self) -> Table:
+        """Return the positions of the subgoals that are planned for the hard task."""
+
+        def compute() -> Table:
+            start, goal = self._hard_pair()
+            way = np.stack([start, *imagination.first_plan(self.policy, start, goal), goal])
+            x, y = way[:, POSITION].T.astype(np.float64)
+            return {"x": x, "y": y}
+
+        return self._table("plan", compute)
 
     def values(self) -> Table:
         """Return the value of the goal of the hard task at points all over the arena."""

@@ -1,0 +1,345 @@
+"""The pictures of an episode, step by step: a maze, the arm's table, or images side by side."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, TypeAlias, cast, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+
+from midway.envs.mazes import Maze
+from midway.reports import imagination, maps, strips, style, tabletop
+from midway.reports.rollouts import Recording
+from midway.reports.strips import Images
+from midway.reports.study import POSITION, maze_of
+from midway.training import decoder as decoders
+from midway.training.folder import RunFolder
+from midway.training.policy import Policy
+from midway.types import ConfigurationError
+
+Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
+
+PIXELS = 100
+"""Pixels per inch of a frame."""
+
+SUBGOALS = 20
+"""Imagined subgoals at each step."""
+
+SIDE = 2.6
+"""Width of an image in a frame (inches)."""
+
+TABLE_WIDTH = 6.0
+"""Width of the table in a frame (inches)."""
+
+
+@runtime_checkable
+class Scene(Protocol):
+    """Draws the frames of one episode; all frames of a video have the same size."""
+
+    def frame(self, step: int) -> Frame:
+        """Return the picture after so many steps."""
+        ...
+
+
+MakeScene: TypeAlias = Callable[[Recording], Scene]
+
+
+def maker(folder: RunFolder, policy: Policy, title: str) -> MakeScene:
+    """Return what makes the scene of an episode.
+
+    Args:
+        folder: The run folder.
+        policy: Its policy, asked for subgoals in every state if it imagines any.
+        title: What is shown.
+
+    Raises:
+        ConfigurationError: There is no scene of the policy's environment.
+    """
+    env = policy.config.env
+    maze = maze_of(env)
+    if maze is not None:
+        return lambda recording: MazeScene(maze, title, policy, recording)
+    if policy.state.spec.is_image:
+        decode = decoding(folder, policy)
+        return lambda recording: ImageScene(title, policy, recording, decode)
+    if tabletop.has_table(env):
+        return lambda recording: TableScene(title, policy, recording)
+    raise ConfigurationError(f"{env}: videos are made of mazes and of push only")
+
+
+class Stage:
+    """A figure whose background is drawn once; each frame adds what moves.
+
+    Args:
+        figure: The figure with all that stands still.
+        moving: What moves, hidden from the background.
+    """
+
+    def __init__(self, figure: Figure, moving: Sequence[Artist]) -> None:
+        self._figure = figure
+        self._moving = moving
+        for artist in moving:
+            artist.set_animated(True)
+        figure.set_dpi(PIXELS)
+        self._canvas = cast(Any, figure.canvas)
+        self._canvas.draw()
+        self._background = self._canvas.copy_from_bbox(figure.bbox)
+
+    def frame(self) -> Frame:
+        """Return the picture with everything where it is now; both sides are even."""
+        self._canvas.restore_region(self._background)
+        for artist in self._moving:
+            self._figure.draw_artist(artist)
+        pixels = np.asarray(self._canvas.buffer_rgba())[..., :3]
+        height, width = (side - side % 2 for side in pixels.shape[:2])
+        return pixels[:height, :width].copy()
+
+
+class MazeScene:
+    """A maze from above, with the agent, its trail, its goal and the subgoals it imagines.
+
+    Args:
+        maze: The maze.
+        title: What is shown.
+        policy: The policy, asked for subgoals in every state if it imagines any.
+        recording: The episode.
+    """
+
+    def __init__(self, maze: Maze, title: str, policy: Policy, recording: Recording) -> None:
+        self._path = recording.achieved[:, POSITION]
+        self._subgoals = imagined(policy, recording)
+        self._kind = kind_of(recording)
+        self._words = Words(policy, recording, unit=1.0)
+        figure, (axes,) = maps.panels(maze, 1)
+        _head(axes, title)
+        maps.draw_ends(axes, self._path[0], recording.goal[POSITION], size=1.4)
+        self._trail, self._agent, self._marks = (
+            axes.plot([], [], **look)[0]
+            for look in (
+                {"color": style.BLUE, "linewidth": 2, "zorder": 4},
+                {"color": style.BLUE, "marker": "o", "markersize": 11, "zorder": 7},
+                {**_diamonds(), "zorder": 6},
+            )
+        )
+        style.legend_below(figure, self._legend())
+        self._text = _text(axes)
+        self._stage = Stage(figure, [self._trail, self._agent, self._marks, self._text])
+
+    def frame(self, step: int) -> Frame:
+        """Return the picture after so many steps."""
+        self._trail.set_data(*self._path[: step + 1].T)
+        self._agent.set_data(*self._path[step : step + 1].T)
+        if self._subgoals is not None:
+            self._marks.set_data(*self._subgoals[step][:, POSITION].T)
+        self._text.set_text(self._words.after(step))
+        return self._stage.frame()
+
+    def _legend(self) -> list[Line2D]:
+        look: dict[str, Any] = {"color": style.BLUE, "marker": "o", "markersize": 9, "linewidth": 2}
+        entries = [Line2D([], [], label="agent", **look), *maps.ends_legend()]
+        if self._subgoals is not None:
+            entries.append(Line2D([], [], label=f"{self._kind} subgoals", **_diamonds()))
+        return entries
+
+
+class TableScene:
+    """The table from above, with hand, puck, their ways and goals, and imagined subgoals.
+
+    Args:
+        title: What is shown.
+        policy: The policy, asked for subgoals in every state if it imagines any.
+        recording: The episode, of hand x, y and puck x, y (m).
+    """
+
+    def __init__(self, title: str, policy: Policy, recording: Recording) -> None:
+        self._states = recording.states
+        self._subgoals = tabletop.subgoals(policy, recording)
+        self._kind = kind_of(recording)
+        self._words = Words(policy, recording, unit=0.01)
+        figure, (axes,) = tabletop.panels(1, 1, TABLE_WIDTH)
+        _head(axes, title)
+        tabletop.draw_state(axes, recording.target, maps.GOAL)
+        self._ways = [
+            axes.plot([], [], color=style.BLUE, linewidth=width, alpha=0.6, zorder=4)[0]
+            for width in (1.0, 2.6)
+        ]
+        self._marks = [
+            axes.plot([], [], marker, color=maps.SUBGOAL, markersize=6, alpha=0.7, zorder=5)[0]
+            for marker in ("s", "o")
+        ]
+        self._hand = axes.plot([], [], "s", color=style.BLUE, markersize=11, zorder=7)[0]
+        look: dict[str, Any] = {"facecolor": style.BLUE, "alpha": 0.45, "zorder": 3}
+        self._puck = Circle((0, 0), tabletop.PUCK_RADIUS, **look)
+        axes.add_patch(self._puck)
+        style.legend_below(figure, self._legend())
+        self._text = _text(axes)
+        moving = [self._puck, *self._ways, *self._marks, self._hand, self._text]
+        self._stage = Stage(figure, moving)
+
+    def frame(self, step: int) -> Frame:
+        """Return the picture after so many steps."""
+        parts = (tabletop.HAND, tabletop.PUCK)
+        for part, way, marks in zip(parts, self._ways, self._marks, strict=True):
+            way.set_data(*self._states[: step + 1, part].T)
+            if self._subgoals is not None:
+                marks.set_data(*self._subgoals[step][:, part].T)
+        self._hand.set_data(*self._states[step : step + 1, tabletop.HAND].T)
+        puck: Any = tuple(self._states[step, tabletop.PUCK])
+        self._puck.set_center(puck)
+        self._text.set_text(self._words.after(step))
+        return self._stage.frame()
+
+    def _legend(self) -> list[Line2D]:
+        hollow: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 2, "markersize": 10}
+        look: dict[str, Any] = {"linestyle": "", "color": style.BLUE}
+        goal: dict[str, Any] = {"linestyle": "", "color": maps.GOAL}
+        entries = [
+            Line2D([], [], marker="s", label="hand", **look),
+            Line2D([], [], marker="o", markersize=10, alpha=0.45, label="puck", **look),
+            Line2D([], [], marker="s", label="goal of the hand", **goal),
+            Line2D([], [], marker="o", label="goal of the puck", **goal, **hollow),
+        ]
+        if self._subgoals is not None:
+            dots: dict[str, Any] = {"linestyle": "", "color": maps.SUBGOAL}
+            entries.append(Line2D([], [], marker="s", label=f"{self._kind} subgoals: hand", **dots))
+            entries.append(Line2D([], [], marker="o", label="and puck", **dots))
+        return entries
+
+
+class ImageScene:
+    """What the camera sees, the mean imagined subgoal if there is one, and the goal.
+
+    Args:
+        title: What is shown.
+        policy: The policy.
+        recording: The episode, of images.
+        decode: Returns the images of the subgoals in every state, or None.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        policy: Policy,
+        recording: Recording,
+        decode: Callable[[Recording], Images | None],
+    ) -> None:
+        subgoals = decode(recording)
+        films = {"now": recording.observations}
+        films |= {} if subgoals is None else {f"{kind_of(recording)} subgoal": subgoals}
+        self._films = list(films.values())
+        self._words = Words(policy, recording, unit=0.01)
+        columns = len(films) + 1
+        figure, axes = style.figure(1, columns, height=SIDE + 0.9, width=columns * (SIDE + 0.1))
+        for panel in axes:
+            panel.set_axis_off()
+        figure.suptitle(f"{title}\n", fontsize=style.TEXT, color=style.INK)
+        for panel, name in zip(axes, [*films, "goal"], strict=True):
+            panel.set_title(name, fontsize=style.TEXT, color=style.INK)
+        axes[-1].imshow(recording.goal)
+        self._images = [
+            panel.imshow(film[0]) for panel, film in zip(axes, self._films, strict=False)
+        ]
+        look: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": style.TEXT}
+        self._text = figure.text(0.5, 0.93, "", color=style.INK, **look)
+        self._stage = Stage(figure, [*self._images, self._text])
+
+    def frame(self, step: int) -> Frame:
+        """Return the picture after so many steps."""
+        for image, film in zip(self._images, self._films, strict=True):
+            image.set_data(film[step])
+        self._text.set_text(self._words.after(step))
+        return self._stage.frame()
+
+
+class Words:
+    """What is said of every step: how far the goal is.
+
+    Args:
+        policy: The policy, whose task measures distances.
+        recording: The episode.
+        unit: 1 for metres, 0.01 for centimetres.
+    """
+
+    def __init__(self, policy: Policy, recording: Recording, unit: float) -> None:
+        task: Any = policy.state.spec.task
+        pair = recording.states, recording.target
+        named = task.named_distances(*pair) if getattr(task, "names", ()) else {}
+        self._distances = named or {"": task.distance(*pair)}
+        self._end = recording.length if recording.success else -1
+        self._unit = unit
+
+    def after(self, step: int) -> str:
+        """Return the words after so many steps."""
+        if step == self._end:
+            return f"step {step}, goal reached"
+        unit = "m" if self._unit == 1 else "cm"
+        digits = 1 if self._unit == 1 else 0
+        parts = (
+            f"{name + ' ' if name else ''}{distances[step] / self._unit:.{digits}f} {unit}"
+            for name, distances in self._distances.items()
+        )
+        return f"step {step}, {', '.join(parts)} to the goal"
+
+
+def kind_of(recording: Recording) -> str:
+    """Return what the subgoals of an episode are, if there are any."""
+    return "imagined" if recording.plans is None else "planned"
+
+
+def imagined(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I G"] | None:
+    """Return the subgoals in every state, imagined or planned; None if the agent has none."""
+    if recording.plans is not None:
+        return np.concatenate([recording.plans, recording.plans[-1:]])
+    if not imagination.imagines(policy.config.agent):
+        return None
+    goals = np.repeat(recording.goal[None], len(recording.observations), axis=0)
+    return imagination.subgoals(policy, recording.observations, goals, SUBGOALS)
+
+
+def decoding(folder: RunFolder, policy: Policy) -> Callable[[Recording], Images | None]:
+    """Return what gives the subgoal in every state as an image; it returns None without any.
+
+    It is the mean of those imagined (RIS), or the one planned for the running segment (LEAP).
+    """
+    if imagination.plans(policy.config.agent):
+        return lambda recording: strips.decoded(policy.state.vae.decode, _aims(policy, recording))
+    if not (imagination.imagines(policy.config.agent) and decoders.has_encoder(policy)):
+        return lambda recording: None
+    decoder = strips.decoder_of(folder, policy)
+
+    def decode(recording: Recording) -> Images:
+        goals = np.repeat(recording.goal[None], len(recording.observations), axis=0)
+        mean = imagination.distribution(policy, recording.observations, goals)[0]
+        return strips.decoded(decoder, mean)
+
+    return decode
+
+
+def _aims(policy: Policy, recording: Recording) -> Float[np.ndarray, "T L"]:
+    """Return the planned subgoal that is aimed at in every state, as a code; at last the last."""
+    assert recording.plans is not None
+    steps = np.minimum(np.arange(recording.length + 1), recording.length - 1)
+    segment = policy.agent.segment_steps(policy.config.hyperparameters, policy.state.spec)
+    places = np.minimum(steps // segment, recording.plans.shape[1] - 1)
+    return np.asarray(recording.plans[steps, places])
+
+
+def _head(axes: Axes, title: str) -> None:
+    """Write the title, with a line below it for words; no axes."""
+    axes.set(xlabel="", ylabel="", xticks=[], yticks=[])
+    axes.set_title(f"{title}\n", fontsize=style.TEXT, color=style.INK)
+
+
+def _text(axes: Axes) -> Any:
+    """Return the words above a map."""
+    middle: dict[str, Any] = {"ha": "center", "va": "bottom", "color": style.INK}
+    return axes.text(0.5, 1.0, "", transform=axes.transAxes, **middle)
+
+
+def _diamonds() -> dict[str, Any]:
+    look = {"color": maps.SUBGOAL, "marker": "D", "linestyle": ""}
+    return {**look, "markersize": 6, "markeredgecolor": "none", "alpha": 0.7}

@@ -1,0 +1,154 @@
+"""The table of the arm from above: where a policy brings hand and puck, and what it imagines."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from matplotlib.patches import Rectangle as Patch
+
+from midway.envs.push import IMAGE_SPEC, STATE_SPEC
+from midway.envs.push_scene import HAND_BOX
+from midway.reports import imagination, maps, style
+from midway.reports.rollouts import Recording, record
+from midway.training.policy import Policy
+
+HAND, PUCK = slice(0, 2), slice(2, 4)
+"""x and y of the hand and of the puck in a state (m)."""
+
+PUCK_RADIUS = 0.04
+"""As the puck is drawn (m)."""
+
+MARGIN = 0.06
+"""How much is drawn around what the hand can reach (m)."""
+
+COLUMNS = 3
+"""Episodes of each task on a figure."""
+
+TASKS = ("hard", "uniform")
+SUBGOALS = 20
+"""Imagined subgoals that are drawn for a state and a goal."""
+
+
+def has_table(env: str) -> bool:
+    """Return whether the states of an environment are hand x, y and puck x, y."""
+    return env in (STATE_SPEC.name, IMAGE_SPEC.name)
+
+
+def episodes(policy: Policy, seed: int) -> list[Recording]:
+    """Return the episodes of a figure, the hard ones first."""
+    return record(policy, dict.fromkeys(TASKS, COLUMNS), seed)
+
+
+def draw(policy: Policy, recordings: Sequence[Recording], label: str) -> Figure:
+    """Draw the ways of hand and puck, and subgoals imagined or planned at the start."""
+    figure, axes = panels(len(TASKS), COLUMNS)
+    for panel, recording in zip(axes, recordings, strict=True):
+        start, goal = recording.states[0], recording.target
+        draw_ways(panel, recording)
+        imagined = subgoals(policy, recording)
+        if imagined is not None:
+            draw_subgoals(panel, imagined[0])
+        draw_state(panel, start, maps.START)
+        draw_state(panel, goal, maps.GOAL)
+        end = "reached" if recording.success else f"{100 * recording.final_distance:.0f} cm off"
+        style.caption(panel, f"{label}, {recording.task}: {end}")
+    style.legend_below(figure, legend(imagined is not None, recording.plans is not None))
+    return figure
+
+
+def panels(rows: int, columns: int, width: float = style.WIDTH) -> tuple[Figure, list[Axes]]:
+    """Return a figure with plans of the table, turned as the camera sees it."""
+    seen = HAND_BOX.grown(MARGIN)
+    height = rows * (width / columns * seen.half_y / seen.half_x + 0.35) + 0.6
+    figure, axes = style.figure(rows, columns, height=height, width=width)
+    for each in axes:
+        draw_table(each)
+    return figure, axes
+
+
+def draw_table(axes: Axes) -> None:
+    """Draw what the hand can reach; x points left and y down, as in the pictures."""
+    axes.grid(visible=False)
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+    axes.set_facecolor("#f2f1ec")
+    size = (2 * HAND_BOX.half_x, 2 * HAND_BOX.half_y)
+    axes.add_patch(Patch(HAND_BOX.low, *size, facecolor="none", edgecolor=maps.WALL, lw=1))
+    seen = HAND_BOX.grown(MARGIN)
+    axes.set_xlim(seen.high[0], seen.low[0])
+    axes.set_ylim(seen.high[1], seen.low[1])
+    axes.set_aspect("equal")
+
+
+def draw_state(axes: Axes, state: Float[np.ndarray, "4"], colour: str) -> None:
+    """Draw the hand as a square, and the puck as the circle that it is."""
+    puck: Any = tuple(state[PUCK])
+    axes.plot(*state[HAND], "s", color=colour, markersize=7, markeredgecolor="white", zorder=6)
+    axes.add_patch(Circle(puck, PUCK_RADIUS, fill=False, edgecolor=colour, lw=2, zorder=5))
+
+
+def draw_ways(axes: Axes, recording: Recording) -> None:
+    """Draw where hand (thin) and puck (thick) went."""
+    colour = maps.REACHED if recording.success else maps.FAILED
+    for part, width in ((HAND, 1.0), (PUCK, 2.6)):
+        axes.plot(*recording.states[:, part].T, color=colour, linewidth=width, alpha=0.8, zorder=4)
+
+
+def draw_subgoals(axes: Axes, imagined: Float[np.ndarray, "I 4"]) -> None:
+    """Draw imagined subgoals: hands as squares, the middles of pucks as dots."""
+    for part, marker in ((HAND, "s"), (PUCK, "o")):
+        axes.plot(
+            *imagined[:, part].T,
+            marker,
+            color=maps.SUBGOAL,
+            markersize=5,
+            markeredgecolor=style.INK,
+            markeredgewidth=0.4,
+            alpha=0.7,
+            zorder=5,
+        )
+
+
+def subgoals(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I 4"] | None:
+    """Return the subgoals in every state (m), imagined or planned.
+
+    None where there are none, or where they are codes of images.
+    """
+    if policy.state.spec.is_image:
+        return None
+    if recording.plans is not None:
+        return np.concatenate([recording.plans, recording.plans[-1:]])
+    if not imagination.imagines(policy.config.agent):
+        return None
+    goals = np.repeat(recording.goal[None], len(recording.observations), axis=0)
+    return imagination.subgoals(policy, recording.observations, goals, SUBGOALS)
+
+
+def legend(imagined: bool, planned: bool) -> list[Line2D]:
+    """Return the entries of everything on a table."""
+    hollow: dict[str, Any] = {"linestyle": "", "markerfacecolor": "none", "markeredgewidth": 2}
+    dots: dict[str, Any] = {"linestyle": "", "color": maps.SUBGOAL, "markeredgecolor": style.INK}
+    entries = [
+        Line2D([], [], color=maps.START, marker="s", linestyle="", label="hand at the start"),
+        Line2D(
+            [], [], color=maps.START, marker="o", markersize=10, label="puck at the start", **hollow
+        ),
+        Line2D([], [], color=maps.GOAL, marker="s", linestyle="", label="goal of the hand"),
+        Line2D(
+            [], [], color=maps.GOAL, marker="o", markersize=10, label="goal of the puck", **hollow
+        ),
+        Line2D([], [], color=maps.REACHED, linewidth=2, label="way: goal reached (thick: puck)"),
+        Line2D([], [], color=maps.FAILED, linewidth=2, label="way: not reached"),
+    ]
+    kind = "planned" if planned else "imagined"
+    if imagined:
+        entries += [
+            Line2D([], [], marker="s", label=f"{kind} subgoals: hand", **dots),
+            Line2D([], [], marker="o", label="and puck", **dots),
+        ]
+    return entries

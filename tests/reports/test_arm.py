@@ -1,0 +1,204 @@
+"""Reports and videos of the arm and its puck, from states and from images."""
+
+import os
+import shutil
+import subprocess
+import time
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from drawing_here import needs_renderer
+from midway.cli.main import main
+from midway.envs.registry import make_vec
+from midway.reports import compose, report, strips, tabletop, watch, window
+from midway.reports.rollouts import Recording
+from midway.reports.scenes import TableScene, Words
+from midway.training import api, decoder, policy
+from midway.training.folder import RunFolder
+from midway.types import ConfigurationError
+
+CHANGES = {"hidden": (8,), "num_envs": 1, "replay_capacity": 300, "random_steps": 10}
+EVALUATED = (
+    "step,updates,seconds,training_seconds,task,actions,episodes,success_rate,final_distance"
+)
+EVALUATED += ",episode_length,final_distance_hand,final_distance_puck"
+
+
+def untrained(path, env, agent):
+    """Return a run folder of an agent that has learned nothing, with two evaluations."""
+    folder = RunFolder(path)
+    config = api.configure(env, agent, changes=CHANGES)
+    training = api.build(config, folder)
+    folder.create(config)
+    policy.save(folder, config, training.state, 200)
+    rows = [EVALUATED]
+    for step in (100, 200):
+        for task in ("hard", "uniform"):
+            rows += [
+                f"{step},0,1,1,{task},{actions},4,0.5,0.3,90,0.1,0.3"
+                for actions in ("mean", "sampled")
+            ]
+    folder.evaluation_file.write_text("\n".join(rows) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def state_run(tmp_path_factory):
+    return untrained(tmp_path_factory.mktemp("runs") / "state", "push-state", "ris")
+
+
+@pytest.fixture(scope="module")
+def image_run(tmp_path_factory):
+    return untrained(tmp_path_factory.mktemp("runs") / "image", "push", "ris")
+
+
+@pytest.fixture
+def quick_decoder(monkeypatch):
+    for name, value in {"IMAGES": 40, "COPIES": 5, "UPDATES": 2, "UPDATES_PER_CALL": 2}.items():
+        monkeypatch.setattr(decoder, name, value)
+
+
+def stems(files):
+    return {file.stem for file in files if file.suffix == ".png"}
+
+
+def test_the_report_of_states_draws_the_table(state_run, tmp_path):
+    page, *figures = report([state_run], tmp_path)
+    names = {"learning-curves", "distances", "ris-table"}
+    assert stems(figures) == {f"push-state-{name}" for name in names}
+    assert "no maze" not in page.read_text()
+
+
+@needs_renderer
+def test_the_report_of_images_shows_what_is_imagined(image_run, tmp_path, quick_decoder):
+    _, *figures = report([image_run], tmp_path)
+    names = {"learning-curves", "distances", "ris-table", "ris-images"}
+    assert stems(figures) == {f"push-{name}" for name in names}
+    pixels = matplotlib.image.imread(tmp_path / "push-ris-images.png")
+    assert pixels.shape[1] > 1_000
+    assert (image_run / "decoder.safetensors").exists()
+
+
+@needs_renderer
+def test_rows_of_images_are_those_of_the_environment(image_run, quick_decoder):
+    loaded = api.load(image_run)
+    decode = strips.decoder_of(RunFolder(image_run), loaded)
+    rows = strips.rows(loaded, decode, "hard", 2, seed=3)
+    observation, _ = make_vec("push", num_envs=2, task="hard").reset(seed=3)
+    np.testing.assert_array_equal(rows["state"], observation["observation"])
+    np.testing.assert_array_equal(rows["goal"], observation["desired_goal"])
+    assert len(rows) == 6
+    for images in rows.values():
+        assert images.shape == (2, 84, 84, 3)
+        assert images.dtype == np.uint8
+
+
+@needs_renderer
+def test_without_a_drawing_library_images_are_missing_and_the_rest_is_drawn(
+    image_run, tmp_path, monkeypatch
+):
+    def fail(*arguments, **options):
+        raise ConfigurationError("images need OpenGL")
+
+    monkeypatch.setattr(compose.arm.environments, "make_vec", fail)
+    page, *figures = report([image_run], tmp_path)
+    assert stems(figures) == {"push-learning-curves", "push-distances"}
+    assert "images need OpenGL" in page.read_text()
+
+
+def test_a_video_of_the_table(state_run, tmp_path):
+    file = tmp_path / "hard.mp4"
+    assert watch(state_run, file, "hard", 1, 0) == file
+    assert file.stat().st_size > 5_000
+
+
+@needs_renderer
+def test_a_video_of_images(image_run, tmp_path, quick_decoder):
+    file = tmp_path / "uniform.gif"
+    watch(image_run, file, "uniform", 1, 0)
+    assert file.stat().st_size > 20_000
+
+
+def episode(success):
+    states = np.array([[0.1, 0.6, 0.0, 0.6], [0.0, 0.55, 0.0, 0.6]], np.float32)
+    goal = np.array([0.0, 0.55, 0.1, 0.6], np.float32)
+    return Recording("hard", states, states, goal, states, goal, success, 0.1)
+
+
+def test_words_tell_hand_and_puck_apart(state_run):
+    loaded = api.load(state_run)
+    words = Words(loaded, episode(False), 0.01)
+    assert words.after(0) == "step 0, hand 11 cm, puck 10 cm to the goal"
+    assert words.after(1) == "step 1, hand 0 cm, puck 10 cm to the goal"
+    assert Words(loaded, episode(True), 0.01).after(1) == "step 1, goal reached"
+
+
+def test_the_puck_of_a_frame_is_where_it_is_seen_by_the_camera(state_run):
+    """World x points left and y down: the hand at x 0.1 begins on the left of the puck."""
+    scene = TableScene("", api.load(state_run), episode(False))
+    first, second = scene.frame(0).astype(int), scene.frame(1).astype(int)
+    assert first.shape[0] % 2 == first.shape[1] % 2 == 0
+    changed = np.argwhere(np.abs(first - second).sum(-1) > 100)
+    assert len(changed) > 50
+    assert scene.frame(0).tobytes() == first.astype(np.uint8).tobytes()
+
+
+def test_the_table_is_turned_like_the_camera():
+    _, (axes,) = tabletop.panels(1, 1)
+    assert axes.get_xlim()[0] > axes.get_xlim()[1]
+    assert axes.get_ylim()[0] > axes.get_ylim()[1]
+    assert axes.get_aspect() == 1
+
+
+def test_live_without_a_display_is_one_line(state_run, monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(SystemExit) as stop:
+        main(["watch", str(state_run), "--live"])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("midway: --live needs a display")
+    assert error.count("\n") == 1
+
+
+def test_live_writes_no_file(state_run, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["watch", str(state_run), "--live", "--out", str(tmp_path / "a.mp4")])
+    assert stop.value.code == 2
+    assert "--live writes no file" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(
+    shutil.which("Xvfb") is None, reason="no Xvfb on this machine: apt-get install xvfb to run it"
+)
+def test_the_window_shows_the_frame(tmp_path, monkeypatch):
+    """The virtual display keeps its screen in a file, which ends with rows of B, G, R, unused."""
+    read, write = os.pipe()
+    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "400x300x24"]
+    with subprocess.Popen([*command, "-fbdir", str(tmp_path)], pass_fds=[write]) as server:
+        try:
+            os.close(write)
+            with os.fdopen(read) as number:
+                monkeypatch.setenv("DISPLAY", f":{number.readline().strip()}")
+            seen = []
+            window.check()
+            window.play(frames(tmp_path / "Xvfb_screen0", seen), 5, "test")
+        finally:
+            server.terminate()
+    assert seen[-1][40, 30].tolist() == [255, 0, 0]
+    assert seen[-1][120, 30].tolist() == [0, 0, 255]
+
+
+def frames(screen, seen):
+    """Yield a picture that is red above and blue below, until it is seen on the screen."""
+    picture = np.zeros((150, 201, 3), np.uint8)
+    picture[:75, :, 0] = picture[75:, :, 2] = 255
+    for _ in range(100):
+        yield picture
+        pixels = np.frombuffer(screen.read_bytes()[-400 * 300 * 4 :], np.uint8)
+        seen.append(pixels.reshape(300, 400, 4)[..., 2::-1])
+        if seen[-1][40, 30].any():
+            return
+        time.sleep(0.1)
