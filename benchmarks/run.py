@@ -32,6 +32,11 @@ SUITES: dict[str, list[Job]] = {
         for env in POINT_MAZES
         for seed in SEEDS
     ],
+    "point-u-agents": [
+        Job("point-u", agent, seed) for agent in ("tdm", "leap") for seed in range(3)
+    ],
+    "push-state": [Job("push-state", agent, 0) for agent in ("ris", "sac")],
+    "push": [Job("push", "ris", 0)],
     "precision": [Job("point-u", "ris", seed, F32, "f32") for seed in SEEDS],
     "ant-u": [Job("ant-u", agent, 0, (*BF16, "--steps", "1000000")) for agent in ("ris", "sac")],
 }

@@ -1,0 +1,98 @@
+"""Draw one figure of the documentation: its PNG file is written where the documentation shows it.
+
+    python benchmarks/figures.py point-mazes
+    python benchmarks/figures.py point-u-subgoals --runs DIR
+
+Curves come from the CSV files in ``benchmarks/results``. What a policy does or imagines needs the
+run folders themselves: ``--runs`` is the folder that ``benchmarks/run.py`` was given.
+"""
+
+import argparse
+import shutil
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from midway.reports import report
+
+HERE = Path(__file__).parent
+RESULTS = HERE / "results"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a figure comes from.
+
+    Attributes:
+        runs: Patterns of run folders, in the results or in the folder of ``--runs``.
+        file: Its name in the report of these runs.
+        out: Where it goes, in the repository.
+        needs_policies: Whether CSV files are not enough.
+    """
+
+    runs: tuple[str, ...]
+    file: str
+    out: str
+    needs_policies: bool = False
+
+
+FIGURES = {
+    "point-mazes": Source(
+        ("point-mazes/*",), "all-learning-curves", "benchmarks/figures/point-mazes.png"
+    ),
+    "point-u": Source(
+        ("point-mazes/point-u-*",), "point-u-learning-curves", "benchmarks/figures/point-u.png"
+    ),
+    "point-u-agents": Source(
+        ("point-mazes/point-u-*-seed[012]", "point-u-agents/*"),
+        "point-u-learning-curves",
+        "benchmarks/figures/point-u-agents.png",
+    ),
+    "point-u-difficulty": Source(
+        ("point-u-ris-*", "point-u-sac-*"),
+        "point-u-difficulty",
+        "benchmarks/figures/point-u-difficulty.png",
+        True,
+    ),
+    "point-u-subgoals": Source(
+        ("point-u-ris-seed0",), "point-u-ris-subgoals", "docs/images/point-u-subgoals.png", True
+    ),
+    "ant-u": Source(("ant-u/*",), "ant-u-learning-curves", "benchmarks/figures/ant-u.png"),
+    "push-state": Source(
+        ("push-state/*",), "push-state-learning-curves", "benchmarks/figures/push-state.png"
+    ),
+    "push-state-distances": Source(
+        ("push-state/*",), "push-state-distances", "benchmarks/figures/push-state-distances.png"
+    ),
+    "push": Source(("push/*",), "push-learning-curves", "benchmarks/figures/push.png"),
+    "push-images": Source(
+        ("push-ris-seed0",), "push-ris-images", "benchmarks/figures/push-images.png", True
+    ),
+}
+"""Every figure by its name."""
+
+
+def main() -> None:
+    """Draw one figure and print where it is."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("figure", choices=FIGURES)
+    parser.add_argument("--runs", type=Path, help="folder of the run folders")
+    arguments = parser.parse_args()
+    source = FIGURES[arguments.figure]
+    if source.needs_policies and arguments.runs is None:
+        sys.exit(f"{arguments.figure} needs policies: give --runs, the folder of the run folders")
+    folder = arguments.runs if source.needs_policies else RESULTS
+    runs = sorted(path for pattern in source.runs for path in folder.glob(pattern) if path.is_dir())
+    if not runs:
+        sys.exit(f"no runs like {', '.join(source.runs)} in {folder}: see benchmarks/README.md")
+    with tempfile.TemporaryDirectory() as drawn:
+        report(runs, Path(drawn))
+        file = Path(drawn) / f"{source.file}.png"
+        if not file.exists():
+            sys.exit(f"these runs have no {source.file}: see what their report says is missing")
+        print(shutil.copy(file, HERE.parent / source.out))
+
+
+if __name__ == "__main__":
+    main()
