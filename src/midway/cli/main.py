@@ -83,16 +83,19 @@ def train(
     _say_where(run)
 
 
-def resume(run: Positional[Path], steps: OptionalCount = None) -> None:
+def resume(
+    run: Positional[Path], steps: OptionalCount = None, devices: OptionalCount = None
+) -> None:
     """Continue a run from its newest checkpoint.
 
     Args:
         run: Run folder.
         steps: New total of environment steps; default: the run's own.
+        devices: New number of accelerators; default: the run's own.
     """
     from midway.training import api
 
-    _say_where(api.resume(run, steps=steps, progress=True))
+    _say_where(api.resume(run, steps=steps, devices=devices, progress=True))
 
 
 def evaluate(

@@ -57,15 +57,14 @@ def configure(
     """
     environments.entry(env)
     train, hyperparameters = presets.preset(env, agent, preset)
-    for name, value in (changes or {}).items():
-        if name in _field_names(train):
-            train = _changed(train, name, value)
-        elif name in _field_names(hyperparameters):
-            hyperparameters = _changed(hyperparameters, name, value)
-        else:
-            allowed = ", ".join((*_field_names(train), *_field_names(hyperparameters)))
-            raise ConfigurationError(f"unknown setting {name!r}: use one of {allowed}")
-    return RunConfig(env, agent, preset, seed, train, hyperparameters)
+    changes = changes or {}
+    allowed = (*_field_names(train), *_field_names(hyperparameters))
+    for name in changes:
+        if name not in allowed:
+            raise ConfigurationError(f"unknown setting {name!r}: use one of {', '.join(allowed)}")
+    # All at once: two values may fit each other, and one alone not the preset.
+    configs = [_changed(config, changes) for config in (train, hyperparameters)]
+    return RunConfig(env, agent, preset, seed, *configs)
 
 
 def train(
@@ -108,24 +107,30 @@ def train(
     return _run(training, progress)
 
 
-def resume(path: str | Path, steps: int | None = None, progress: bool = False) -> Run:
+def resume(
+    path: str | Path,
+    steps: int | None = None,
+    progress: bool = False,
+    devices: int | None = None,
+) -> Run:
     """Continue a run from its newest whole checkpoint, bit for bit.
 
     Args:
         path: The run folder.
         steps: New total of environment steps; default: the run's own.
         progress: Whether to report on standard error.
+        devices: New number of accelerators, which changes rounding; default: the run's own.
 
     Raises:
-        ConfigurationError: This is no run folder, or its checkpoint is damaged or foreign.
+        ConfigurationError: This is no run folder, its checkpoint is damaged or foreign, or the
+            machine has fewer devices.
         NonFiniteError: A loss became NaN or infinite.
     """
     folder = RunFolder(Path(path))
     config = folder.load_config()
-    if steps is not None:
-        config = dataclasses.replace(
-            config, train=dataclasses.replace(config.train, steps=int(steps))
-        )
+    named = {"steps": steps, "devices": devices}
+    given: dict[str, Any] = {name: int(v) for name, v in named.items() if v is not None}
+    config = dataclasses.replace(config, train=dataclasses.replace(config.train, **given))
     training = build(config, folder)
     folder.note_resume(config)
     return _run(training, progress)
@@ -208,9 +213,16 @@ def _field_names(config: Any) -> tuple[str, ...]:
     return tuple(field.name for field in dataclasses.fields(config))
 
 
-def _changed(config: Any, name: str, value: Any) -> Any:
-    """Return the dataclass with one value replaced by one of the same type."""
-    old = getattr(config, name)
+def _changed(config: Any, changes: Mapping[str, Any]) -> Any:
+    """Return the dataclass with the values replaced that it has a field for."""
+    names = [name for name in changes if name in _field_names(config)]
+    return dataclasses.replace(
+        config, **{name: _converted(getattr(config, name), name, changes[name]) for name in names}
+    )
+
+
+def _converted(old: Any, name: str, value: Any) -> Any:
+    """Return the value in the type of the old one."""
     if isinstance(value, str) and not isinstance(old, str):
         try:
             value = ast.literal_eval(value)
@@ -229,4 +241,4 @@ def _changed(config: Any, name: str, value: Any) -> Any:
         raise ConfigurationError(f"{name} {value!r}: must be a {type(old).__name__}")
     if name == "precision" and value not in ("f32", "bf16"):
         raise ConfigurationError(f"precision {value!r}: choose f32 or bf16")
-    return dataclasses.replace(config, **{name: value})
+    return value

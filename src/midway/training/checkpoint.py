@@ -75,7 +75,7 @@ class Checkpoints:
 
 
 def _abstract(leaf: Any) -> Any:
-    """Describe an array: NumPy arrays come back as NumPy arrays, others on their device."""
+    """Describe an array: NumPy arrays come back as NumPy arrays, others on their devices."""
     if isinstance(leaf, jax.Array):
-        return jax.eval_shape(lambda: leaf)
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
     return np.empty(leaf.shape, leaf.dtype)

@@ -22,6 +22,7 @@ class TrainConfig:
         evaluation_episodes: Episodes for each task and kind of action.
         log_every: Environment steps between rows of ``metrics.csv``.
         checkpoint_every: Environment steps between checkpoints.
+        devices: Accelerators that the batch and the replay are split over.
     """
 
     steps: int = 1_000_000
@@ -35,12 +36,13 @@ class TrainConfig:
     evaluation_episodes: int = 20
     log_every: int = 1_000
     checkpoint_every: int = 50_000
+    devices: int = 1
 
     def __post_init__(self) -> None:
         """Check the numbers.
 
         Raises:
-            ConfigurationError: A number is not positive.
+            ConfigurationError: A number is not positive, or rows cannot be divided over devices.
         """
         for name, value in vars(self).items():
             if name not in ("relabel", "random_steps") and value <= 0:
@@ -50,6 +52,11 @@ class TrainConfig:
                 f"random_steps {self.random_steps}: at least one step of each of the "
                 f"{self.num_envs} environments must come before the first update"
             )
+        for name in ("num_envs", "batch_size"):
+            if getattr(self, name) % self.devices:
+                raise ConfigurationError(
+                    f"{name} {getattr(self, name)}: must be a multiple of devices {self.devices}"
+                )
 
     @property
     def update_ratio(self) -> Fraction:

@@ -24,11 +24,12 @@ from midway.training import step as steps_of
 from midway.training.arrays import named_arrays, with_named_arrays
 from midway.training.checkpoint import Checkpoints
 from midway.training.collect import Collector
+from midway.training.devices import Devices
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.folder import RunConfig, RunFolder
 from midway.training.logging import Logger
 from midway.training.progress import Reporter
-from midway.types import NonFiniteError
+from midway.types import Memory, NonFiniteError
 
 EVALUATED_TASKS = ("hard", "uniform")
 EVALUATED_ACTIONS: tuple[ActionKind, ...] = ("mean", "sampled")
@@ -58,20 +59,23 @@ class Training:
         train = config.train
         seeds = np.random.SeedSequence(config.seed).generate_state(4)
         self._env_seed, self._evaluation_seed, self._action_seed = (int(s) for s in seeds[:3])
-        network_key, self._update_key, self._act_key, self._evaluation_key = jax.random.split(
-            jax.random.key(int(seeds[3])), 4
-        )
+        self._devices = devices = Devices.first(train.devices)
+        keys = devices.copied(jax.random.split(jax.random.key(int(seeds[3])), 4))
+        network_key, self._update_key, self._act_key, self._evaluation_key = keys
         self._make_env = make_env
         env = make_env(train.num_envs, "uniform")
         self.spec = env.goal_spec
-        self.arrays, self._static = steps_of.split_state(
-            agent.create(config.hyperparameters, self.spec, network_key)
+        arrays, self._static = steps_of.split_state(
+            steps_of.create_state(agent, config.hyperparameters, self.spec, network_key)
         )
-        self._begin = partial(acting.begin, agent, config.hyperparameters, self.spec)
+        self.arrays = devices.copied(arrays)
         self._fresh = self.memory = self._begin(train.num_envs)
-        replay = buffer.create(self.spec, train.replay_capacity, train.num_envs)
-        self.totals = steps_of.empty_totals(agent, self.arrays, self._static, train, replay)
-        self.learner = steps_of.compile_learner(agent, self._static, train, self.spec)
+        replay = devices.allocate(
+            partial(buffer.create, self.spec, train.replay_capacity, train.num_envs)
+        )
+        totals = steps_of.empty_totals(agent, self.arrays, self._static, train, replay)
+        self.totals = devices.copied(totals)
+        self.learner = steps_of.compile_learner(agent, self._static, train, self.spec, devices)
         self.collector, self.replay = Collector.start(env, replay, self._env_seed)
         self._evaluation_envs: dict[str, Any] = {}
         self.steps = 0
@@ -90,8 +94,14 @@ class Training:
         state, seconds = pretrain.run(
             self.agent, self.state, self._make_env, self.config.seed, self.folder, say
         )
-        self.arrays, _ = steps_of.split_state(state)
+        self.arrays = self._devices.copied(steps_of.split_state(state)[0])
         self.seconds += seconds
+
+    def _begin(self, episodes: int) -> Memory:
+        """Return what the agent remembers at the start of as many episodes."""
+        return self._devices.copied(
+            acting.begin(self.agent, self.config.hyperparameters, self.spec, episodes)
+        )
 
     # --- one turn of the loop ---------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ from midway.replay import buffer
 from midway.replay.storage import ReplayState
 from midway.training import acting
 from midway.training.config import TrainConfig
+from midway.training.devices import Devices, compile_by_lane
 from midway.types import EnvSpec, Memory, Metrics
 
 Arrays: TypeAlias = PyTree
@@ -37,13 +38,20 @@ class Learner:
     act_mean: Callable[..., tuple[Float[Array, "K action_dim"], Memory]]
 
 
+def create_state(agent: ModuleType, config: Any, spec: EnvSpec, key: Key[Array, ""]) -> Any:
+    """Return the agent's state at its start, made by one compiled program rather than dozens."""
+    return eqx.filter_jit(agent.create)(config, spec, key)
+
+
 def split_state(state: eqx.Module) -> tuple[Arrays, Any]:
     """Split an agent's state into its arrays and what is static."""
     arrays, static = eqx.partition(state, eqx.is_array)
     return arrays, static
 
 
-def compile_learner(agent: ModuleType, static: Any, config: TrainConfig, spec: EnvSpec) -> Learner:
+def compile_learner(
+    agent: ModuleType, static: Any, config: TrainConfig, spec: EnvSpec, devices: Devices
+) -> Learner:
     """Return the agent's compiled functions; each is traced once for the run's shapes."""
 
     def train(
@@ -53,6 +61,8 @@ def compile_learner(agent: ModuleType, static: Any, config: TrainConfig, spec: E
             arrays, totals = carry
             sample_key, update_key = jax.random.split(jax.random.fold_in(key, count))
             batch = buffer.sample(replay, spec, config.relabel, config.batch_size, sample_key)
+            # Whole first: what to draw is then computed on every device, and only rows are sent.
+            batch = devices.split_inside(devices.copied_inside(batch))
             state, metrics = agent.update(eqx.combine(arrays, static), batch, update_key)
             return (split_state(state)[0], jax.tree.map(jnp.add, totals, metrics)), None
 
@@ -65,9 +75,9 @@ def compile_learner(agent: ModuleType, static: Any, config: TrainConfig, spec: E
         return acting.act(agent, eqx.combine(arrays, static), *inputs, explore=explore)
 
     return Learner(
-        train=jax.jit(train, donate_argnums=(0, 1)),
-        act=jax.jit(partial(act, explore=True)),
-        act_mean=jax.jit(partial(act, explore=False)),
+        train=devices.compile(train, donate_argnums=(0, 1)),
+        act=devices.compile(partial(act, explore=True)),
+        act_mean=devices.compile(partial(act, explore=False)),
     )
 
 
@@ -86,8 +96,8 @@ def empty_totals(
     return {name: jnp.zeros(shape.shape, shape.dtype) for name, shape in shapes.items()}
 
 
-begin = jax.jit(buffer.begin, donate_argnums=0)
+begin = compile_by_lane(buffer.begin)
 """Start episodes in place (`midway.replay.buffer.begin`)."""
 
-add = jax.jit(buffer.add, donate_argnums=0)
+add = compile_by_lane(buffer.add)
 """Append steps in place (`midway.replay.buffer.add`)."""
