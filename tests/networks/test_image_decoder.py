@@ -52,6 +52,6 @@ def test_the_loss_is_the_squared_error_of_an_image() -> None:
 def test_fitting_finds_the_images_of_new_codes() -> None:
     """Without the codes, the mean image leaves an error that most of must go."""
     codes, images = squares(600)
-    decoder = fit_to(codes[:500], images[:500], KEY, updates=200)
+    decoder = fit_to(codes[:500], images[:500], KEY, updates=400)
     blank = ((images[500:] / 255 - decoder.background) ** 2).sum((1, 2, 3)).mean()
     assert float(loss(decoder, codes[500:], images[500:])) < 0.4 * float(blank)

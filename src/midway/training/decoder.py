@@ -34,10 +34,10 @@ COPIES = 50
 ACTIONS = 2
 """Random actions after each reset, each of which gives an image too."""
 
-UPDATES = 1_000
+UPDATES = 1_500
 UPDATES_PER_CALL = 100
-BATCH_SIZE = 64
-LEARNING_RATE = 2e-3
+BATCH_SIZE = 32
+LEARNING_RATE = 1.5e-3
 """Adam's rate at the start; it falls to 0 along a cosine."""
 
 Fit: TypeAlias = tuple[ImageDecoder, optax.OptState]
