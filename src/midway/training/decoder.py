@@ -90,14 +90,14 @@ def fit(policy: Policy, env: Any) -> ImageDecoder:
     env_seed, key_seed = np.random.SeedSequence((policy.config.seed, 3)).generate_state(2)
     images = jnp.asarray(sample_images(env, IMAGES, int(env_seed)))
     codes = eqx.filter_jit(lambda encoder, x: encoder(x))(policy.state.encoder, images)
-    return fit_to(codes, images, jax.random.key(int(key_seed)))
+    return fit_to(codes, images, jax.random.key(int(key_seed)), UPDATES)
 
 
 def fit_to(
     codes: Float[Array, "N L"],
     images: UInt8[Array, "N 84 84 3"],
     key: Key[Array, ""],
-    updates: int = UPDATES,
+    updates: int,
 ) -> ImageDecoder:
     """Return a decoder after so many steps of Adam on batches of these pairs."""
     decoder = ImageDecoder(codes.shape[-1], key=key).standardised(codes, images)
