@@ -17,6 +17,9 @@ from midway.networks.mlp import DTYPES, Precision
 BLOCK = 16
 """Images that are worked on at once, so that their maps stay in the cache."""
 
+SMALLEST_PRODUCT = 64
+"""Numbers that a product should sum over at least."""
+
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def convolution(
@@ -36,14 +39,13 @@ def _forward(
     precision: Precision,
 ) -> tuple[Float[Array, "B H2 W2 O"], tuple[Shaped[Array, "..."], ...]]:
     rounded, weight = image.astype(DTYPES[precision]), weight.astype(DTYPES[precision])
-    kernel, channels = weight.shape[0], weight.shape[-1]
-    patches = _patches(rounded, kernel, stride)
-    flat = weight.reshape(-1, channels)
-    filtered = jax.lax.dot_general(
-        patches, flat, (((3,), (0,)), ((), ())), preferred_element_type=jnp.float32
-    )
+    patches = _patches(rounded, weight.shape[0], stride)
+    parts = weight.reshape(len(patches), -1, weight.shape[-1])
+    filtered = jnp.zeros(())
+    for patch, part in zip(patches, parts, strict=True):
+        filtered = filtered + _product(patch, part, axes=((3,), (0,)))
     # Of the image only the shape is needed later; an array carries it through the transformation.
-    return filtered, (patches, weight, jnp.empty((0, *image.shape[1:3])))
+    return filtered, (*patches, weight, jnp.empty((0, *image.shape[1:3])))
 
 
 def _backward(
@@ -52,15 +54,13 @@ def _backward(
     residuals: tuple[Shaped[Array, "..."], ...],
     gradient: Float[Array, "B H2 W2 O"],
 ) -> tuple[Float[Array, "B H W I"], Float[Array, "K K I O"]]:
-    patches, weight, (_, height, width) = *residuals[:2], residuals[2].shape
-    gradient = gradient.astype(patches.dtype)
-    axes = ((0, 1, 2), (0, 1, 2))
-    to_weight = jax.lax.dot_general(
-        patches, gradient, (axes, ((), ())), preferred_element_type=jnp.float32
-    )
+    *patches, weight, empty = residuals
+    gradient = gradient.astype(weight.dtype)
+    pixels = ((0, 1, 2), (0, 1, 2))
+    to_weight = jnp.stack([_product(patch, gradient, axes=pixels) for patch in patches])
     to_image = transposed_convolution(gradient, weight.swapaxes(2, 3), stride)
     # The last pixels that no patch reaches have no gradient.
-    missing = [(0, size - to_image.shape[i + 1]) for i, size in enumerate((height, width))]
+    missing = [(0, size - to_image.shape[i]) for i, size in enumerate(empty.shape) if i > 0]
     return jnp.pad(to_image, [(0, 0), *missing, (0, 0)]), to_weight.reshape(weight.shape)
 
 
@@ -69,17 +69,26 @@ convolution.defvjp(_forward, _backward)
 
 def _patches(
     image: Shaped[Array, "B H W I"], kernel: int, stride: int
-) -> Shaped[Array, "B H2 W2 KKI"]:
-    """Return what each output sees: ``kernel`` times ``kernel`` pixels, row by row."""
+) -> list[Shaped[Array, "B H2 W2 P"]]:
+    """Return what each output sees, a part for each row of the kernel.
+
+    Adding the products of the parts spares a copy as large as all of them; of few channels, where
+    such products are slow, all rows are one part.
+    """
     height, width = ((size - kernel) // stride * stride + 1 for size in image.shape[1:3])
-    return jnp.concatenate(
-        [
-            image[:, row : row + height : stride, column : column + width : stride]
-            for row in range(kernel)
-            for column in range(kernel)
-        ],
-        axis=-1,
-    )
+    across = [image[:, :, column : column + width : stride] for column in range(kernel)]
+    wide = jnp.concatenate(across, axis=-1)
+    rows = [wide[:, row : row + height : stride] for row in range(kernel)]
+    return rows if wide.shape[-1] >= SMALLEST_PRODUCT else [jnp.concatenate(rows, axis=-1)]
+
+
+def _product(
+    left: Shaped[Array, "..."],
+    right: Shaped[Array, "..."],
+    axes: tuple[tuple[int, ...], tuple[int, ...]],
+) -> Float[Array, "..."]:
+    """Return the product over these axes of both, summed in float32."""
+    return jax.lax.dot_general(left, right, (axes, ((), ())), preferred_element_type=jnp.float32)
 
 
 def transposed_convolution(
@@ -93,9 +102,8 @@ def transposed_convolution(
     tiles = -(-kernel // stride)
     to_tiles = [(0, tiles * stride - kernel)] * 2 + [(0, 0)] * 2
     flat = jnp.pad(weight, to_tiles).transpose(2, 0, 1, 3).reshape(channels, -1)
-    patches = jax.lax.dot_general(
-        image, flat, (((3,), (0,)), ((), ())), preferred_element_type=jnp.float32
-    ).reshape(batch, height, width, tiles, stride, tiles, stride, out)
+    patches = _product(image, flat, axes=((3,), (0,)))
+    patches = patches.reshape(batch, height, width, tiles, stride, tiles, stride, out)
     total = jnp.zeros(())
     for row in range(tiles):
         for column in range(tiles):
