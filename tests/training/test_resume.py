@@ -74,7 +74,7 @@ def interrupt_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
     monkeypatch.setattr(loop.Training, "advance", interrupted)
 
 
-@pytest.mark.parametrize("stop", [20, 132, 236])
+@pytest.mark.parametrize("stop", [20, 100, 132, 236])
 def test_interrupted_and_resumed_equals_uninterrupted(
     whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int
 ) -> None:

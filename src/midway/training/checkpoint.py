@@ -29,11 +29,13 @@ class Checkpoints:
         )
 
     def save(self, step: int, state: Any) -> None:
-        """Write a state, a nested dictionary of arrays.
+        """Write a state, a nested dictionary of arrays, unless that of this step is there.
 
         Raises:
             OSError: It cannot be written; the checkpoints before it are as they were.
         """
+        if step == self.latest():
+            return
         try:
             self._manager.save(step, args=ocp.args.StandardSave(state), force=True)
             self._manager.wait_until_finished()
