@@ -41,7 +41,7 @@ def panels(maze: Maze, columns: int, side: float = 0.0) -> tuple[Figure, list[Ax
     ratio = maze.arena.half_y / maze.arena.half_x
     height = min((style.WIDTH - side - 0.9) / columns * ratio, PANEL_HEIGHT)
     width = min(style.WIDTH, columns * (height / ratio + 0.4) + side + 0.5)
-    figure, axes = style.figure(1, columns, height=height + 1.5, width=width, sharey=True)
+    figure, axes = style.figure(1, columns, height=height + 1.8, width=width, sharey=True)
     for each in axes:
         draw_maze(each, maze)
     for each in axes[1:]:
