@@ -176,6 +176,7 @@ QUICK["push"] = replace(
     evaluation_episodes=50,
     log_every=2_000,
     checkpoint_every=50_000,
+    task="near",  # [code] hands that start beside the puck push it now and then
 )
 QUICK["push-state"] = replace(QUICK["push"], updates_per_step=1.0, batch_size=256)
 """The loop by environment or family of environments; others take the point's."""

@@ -14,7 +14,7 @@ from midway.networks.convolution import (
 )
 
 KEY = jax.random.key(0)
-SIZES = [(84, 3, 2, 3), (41, 3, 2, 4), (20, 3, 2, 4), (9, 3, 1, 4), (27, 5, 3, 4), (7, 2, 3, 2)]
+SIZES = [(84, 3, 2, 3), (41, 3, 2, 32), (20, 3, 2, 32), (9, 3, 1, 32), (27, 5, 3, 4), (7, 2, 3, 2)]
 """Side of the image, kernel, stride and channels."""
 
 

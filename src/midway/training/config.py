@@ -23,6 +23,7 @@ class TrainConfig:
         log_every: Environment steps between rows of ``metrics.csv``.
         checkpoint_every: Environment steps between checkpoints.
         devices: Accelerators that the batch and the replay are split over.
+        task: Task of the environment whose starts and goals are trained on.
     """
 
     steps: int = 1_000_000
@@ -37,6 +38,7 @@ class TrainConfig:
     log_every: int = 1_000
     checkpoint_every: int = 50_000
     devices: int = 1
+    task: str = "uniform"
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -45,7 +47,7 @@ class TrainConfig:
             ConfigurationError: A number is not positive, or rows cannot be divided over devices.
         """
         for name, value in vars(self).items():
-            if name not in ("relabel", "random_steps") and value <= 0:
+            if name not in ("relabel", "random_steps", "task") and value <= 0:
                 raise ConfigurationError(f"{name} {value}: must be positive")
         if self.random_steps < self.num_envs:
             raise ConfigurationError(

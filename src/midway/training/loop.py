@@ -63,7 +63,7 @@ class Training:
         keys = devices.copied(jax.random.split(jax.random.key(int(seeds[3])), 4))
         network_key, self._update_key, self._act_key, self._evaluation_key = keys
         self._make_env = make_env
-        env = make_env(train.num_envs, "uniform")
+        env = make_env(train.num_envs, train.task)
         self.spec = env.goal_spec
         arrays, self._static = steps_of.split_state(
             steps_of.create_state(agent, config.hyperparameters, self.spec, network_key)
