@@ -4,9 +4,10 @@
     python benchmarks/speed.py [--json FILE]
 
 Both take ant-u's sizes, two hidden layers of 256 and the same batch, and both sample and relabel
-within the timed call. Their calls alternate; medians of times and of ratios are printed, so that a
-machine
-that drifts slows both alike. Run it with nothing else on the machine.
+within the timed call, which makes as many updates as follow a step of eight environments. Rounds
+of both alternate, so that a machine that drifts slows both alike; a pause before each round lets
+the threads of the other one fall asleep, which wait busily for a while. Medians of times for one
+update, and of the ratios round by round, are printed. Run it with nothing else on the machine.
 """
 
 import argparse
@@ -25,7 +26,16 @@ import midway
 from midway.training import bench
 
 BATCHES = (256, 2048)
-REPETITIONS = 40
+UPDATES = 8
+"""Updates in a call."""
+
+ROUNDS = 8
+CALLS = 5
+"""Calls of each in a round; the first is not counted."""
+
+PAUSE = 0.5
+"""Seconds of sleep before a round."""
+
 STEPS = 20_000
 """Random steps in each replay before anything is timed."""
 
@@ -50,25 +60,30 @@ def main() -> None:
 def compare(batch: int, precision: str) -> dict[str, Any]:
     """Return medians of both updates in milliseconds and of the ratio pair by pair."""
     pieces = {"midway": ours(batch, precision), "stable_baselines3": theirs(batch)}
-    for piece in pieces.values():
-        for _ in range(3):
-            piece()
-    times: dict[str, list[float]] = {name: [] for name in pieces}
-    for _ in range(REPETITIONS):
+    rounds: dict[str, list[float]] = {name: [] for name in pieces}
+    for _ in range(ROUNDS):
         for name, piece in pieces.items():
-            started = time.perf_counter()
-            piece()
-            times[name].append(1e3 * (time.perf_counter() - started))
-    pairs = zip(times["stable_baselines3"], times["midway"], strict=True)
-    ratios = [theirs / ours for theirs, ours in pairs]
-    figures = {f"{name}_ms": round(statistics.median(t), 2) for name, t in times.items()}
-    speedup = round(statistics.median(ratios), 2)
-    return {"batch": batch, "precision": precision, **figures, "speedup": speedup}
+            rounds[name].append(one_round(piece))
+    pairs = zip(rounds["stable_baselines3"], rounds["midway"], strict=True)
+    speedup = statistics.median(theirs / ours for theirs, ours in pairs)
+    figures = {f"{name}_ms": round(statistics.median(t), 2) for name, t in rounds.items()}
+    return {"batch": batch, "precision": precision, **figures, "speedup": round(speedup, 2)}
+
+
+def one_round(piece: Callable[[], None]) -> float:
+    """Return the median time of one update in milliseconds."""
+    time.sleep(PAUSE)
+    times = []
+    for _ in range(CALLS):
+        started = time.perf_counter()
+        piece()
+        times.append(1e3 * (time.perf_counter() - started) / UPDATES)
+    return statistics.median(times[1:])
 
 
 def ours(batch: int, precision: str) -> Callable[[], None]:
-    """Return one SAC update of midway, sampling and relabelling included."""
-    training = bench.filled("ant-u", "sac", batch, precision, updates_per_call=1)
+    """Return SAC updates of midway, sampling and relabelling included."""
+    training = bench.filled("ant-u", "sac", batch, precision, updates_per_call=UPDATES)
 
     def update() -> None:
         training.arrays, training.totals = training.learner.train(
@@ -80,7 +95,7 @@ def ours(batch: int, precision: str) -> Callable[[], None]:
 
 
 def theirs(batch: int) -> Callable[[], None]:
-    """Return one SAC update of Stable-Baselines3 with its hindsight replay."""
+    """Return SAC updates of Stable-Baselines3 with its hindsight replay."""
     import gymnasium
 
     model = SAC(
@@ -97,7 +112,7 @@ def theirs(batch: int) -> Callable[[], None]:
     model.learn(total_timesteps=STEPS)
 
     def update() -> None:
-        model.train(gradient_steps=1, batch_size=batch)
+        model.train(gradient_steps=UPDATES, batch_size=batch)
 
     return update
 
