@@ -230,7 +230,7 @@ def watch(
 
 
 def bench(
-    what: Positional[Literal["all", "update", "env", "replay", "loop"]] = "all",
+    what: Positional[Literal["all", "update", "env", "replay", "loop", "memory"]] = "all",
     env: str = "ant-u",
     agent: str = "ris",
     batch: Count = 256,
@@ -238,7 +238,7 @@ def bench(
     num_envs: Count = 64,
     json: bool = False,
 ) -> None:
-    """Measure how fast this machine updates, simulates and stores.
+    """Measure how fast this machine updates, simulates and stores, and what memory that takes.
 
     Args:
         what: One piece, or all of them.
@@ -254,8 +254,9 @@ def bench(
     pieces: dict[str, Callable[[], dict[str, Any]]] = {
         "update": lambda: measure.update(env, agent, batch, precision),
         "env": lambda: measure.environment(env, num_envs),
-        "replay": lambda: measure.replay(env, batch, 1_000_000),
+        "replay": lambda: measure.replay(env, batch),
         "loop": lambda: measure.whole_loop(env, agent, batch, precision),
+        "memory": lambda: measure.memory(env, agent, batch, precision),
     }
     chosen = pieces if what == "all" else {what: pieces[what]}
     of = {"env": env, "agent": agent, "batch": batch, "precision": precision, "num_envs": num_envs}

@@ -1,4 +1,4 @@
-"""How fast the pieces run on this machine: update, environment, replay, and the loop of them.
+"""How fast the pieces run on this machine, and what they take: update, environment, replay, loop.
 
 Times are medians over repetitions after a warm-up; where two things are compared, their repetitions
 alternate, so that a machine that drifts slows both.
@@ -15,28 +15,38 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 
 from midway.envs import registry as environments
 from midway.replay import buffer
+from midway.replay.storage import num_bytes
 from midway.training import api, loop, step
 from midway.training.folder import RunFolder
+from midway.types import EnvSpec
 
 Figures = dict[str, Any]
 
 REPETITIONS = 30
 ROWS = 20_000
 """Rows in the replay that updates draw from: more than the processor's caches hold."""
+IMAGE_ROWS = 4_000
+"""The same for images, which are of noise: what the numbers are costs nothing."""
 
 
 def machine() -> Figures:
     """Return what the figures depend on."""
     packages = ("midway", "jax", "jaxlib", "mujoco", "numpy")
+    cores = len(os.sched_getaffinity(0))
     return {
         "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": cores,
+        "threads": cores,  # of compiled programs, and again as many of simulations
         "device": jax.devices()[0].device_kind,
+        "devices": len(jax.devices()),
+        "flags": os.environ.get("XLA_FLAGS", ""),
+        "python": platform.python_version(),
         "versions": {name: importlib.metadata.version(name) for name in packages},
     }
 
@@ -144,14 +154,14 @@ def environment(env: str, num_envs: int) -> Figures:
     return figures
 
 
-def replay(env: str, batch: int, capacity: int) -> Figures:
+def replay(env: str, batch: int) -> Figures:
     """Time writing one step of 8 environments and drawing a batch, and say what the ring takes.
 
     Args:
         env: Environment, for the sizes.
         batch: Transitions of one draw.
-        capacity: Rows of the ring.
     """
+    capacity = transitions_of(environments.make_vec(env).goal_spec)
     training = filled(env, "sac", batch, "f32", 1, replay_capacity=capacity)
     observation = training.collector.observation
     actions = np.zeros((training.config.train.num_envs, training.spec.action_dim), np.float32)
@@ -168,6 +178,46 @@ def replay(env: str, batch: int, capacity: int) -> Figures:
     )
     size = buffer.memory_bytes(training.spec, capacity, training.config.train.num_envs)
     return {**times, "gib": size / 2**30}
+
+
+def memory(env: str, agent: str, batch: int, precision: str) -> Figures:
+    """Return what a run takes after an update from a full-sized replay, in GiB.
+
+    ``arrays_gib`` adds up the sizes of the replay's arrays, ``replay_gib`` is what the process
+    gives back when they are freed, ``process_gib`` is all that it had in main memory before, and
+    ``peak_gib`` the most that it ever had: to be looked at in a process that does nothing else.
+
+    Args:
+        env: Environment.
+        agent: Agent.
+        batch: Transitions of one update.
+        precision: ``f32`` or ``bf16``.
+    """
+    spec = environments.make_vec(env).goal_spec
+    episodes = -(-transitions_of(spec) // (8 * spec.max_episode_steps))
+    rows = 8 * episodes * (spec.max_episode_steps + 2)
+    training = filled(env, agent, batch, precision, 1, replay_capacity=rows)
+    arguments = (training.arrays, training.totals, training.replay, jax.random.key(0), 0)
+    jax.block_until_ready(training.learner.train(*arguments))
+    size = num_bytes(training.replay)
+    process, peak = resident_bytes()
+    for array in jax.tree.leaves(training.replay):
+        array.delete()
+    figures = {"arrays": size, "replay": process - resident_bytes()[0], "process": process}
+    gib = {f"{name}_gib": number / 2**30 for name, number in {**figures, "peak": peak}.items()}
+    return {"transitions": 8 * episodes * spec.max_episode_steps, **gib}
+
+
+def transitions_of(spec: EnvSpec) -> int:
+    """Return how many transitions a full-sized replay holds: a million, or 100,000 of images."""
+    return 100_000 if spec.is_image else 1_000_000
+
+
+def resident_bytes() -> tuple[int, int]:
+    """Return what this process has in main memory, and the most that it ever had."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    values = {line.partition(":")[0]: line.split()[1] for line in lines if "kB" in line}
+    return 1024 * int(values["VmRSS"]), 1024 * int(values["VmHWM"])
 
 
 def whole_loop(env: str, agent: str, batch: int, precision: str) -> Figures:
@@ -224,9 +274,31 @@ def filled(
     }
     config = api.configure(env, agent, "quick", 0, settings)
     training = api.build(config, RunFolder(Path(tempfile.gettempdir()) / "midway-bench"))
+    if training.spec.is_image:
+        _fill_with_noise(training)
     while training.steps < training.config.train.random_steps:
         training.advance()
     return training
+
+
+def _fill_with_noise(training: loop.Training) -> None:
+    """Write episodes of noise into the replay, which takes less long than to draw images."""
+    num_envs = training.config.train.num_envs
+    everyone = np.ones(num_envs, np.bool_)
+    generator = np.random.default_rng(0)
+    actions = np.zeros((num_envs, training.spec.action_dim), np.float32)
+    for number in range(1, IMAGE_ROWS // num_envs + 1):
+        noise = {
+            name: generator.integers(0, 256, value.shape, np.uint8)
+            if value.dtype == np.uint8
+            else value
+            for name, value in training.collector.observation.items()
+        }
+        training.replay = step.add(training.replay, actions, noise, everyone)
+        if number % training.spec.max_episode_steps == 0:
+            training.replay = step.begin(training.replay, noise, everyone)
+    training.replay = step.begin(training.replay, training.collector.observation, everyone)
+    training.steps = training.config.train.random_steps
 
 
 def _product_flops(function: Any, arguments: tuple[Any, ...]) -> float:
@@ -235,15 +307,16 @@ def _product_flops(function: Any, arguments: tuple[Any, ...]) -> float:
 
 
 def _products(jaxpr: Any) -> list[float]:
-    """Return 2 x outputs x contracted length of each product, also of inner functions."""
+    """Return 2 x outputs x contracted length of each product, also of inner functions and loops."""
     found = []
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
             (contracted, _), _ = equation.params["dimension_numbers"]
             lengths = [equation.invars[0].aval.shape[axis] for axis in contracted]
             found.append(2.0 * equation.outvars[0].aval.size * float(np.prod(lengths)))
-        for inner in jax.core.jaxprs_in_params(equation.params):
-            found += _products(inner)
+        turns = equation.params.get("length", 1) if equation.primitive.name == "scan" else 1
+        for inner in jax.extend.core.jaxprs_in_params(equation.params):
+            found += [turns * product for product in _products(inner)]
     return found
 
 
