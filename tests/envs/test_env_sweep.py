@@ -5,11 +5,11 @@ import io
 import gymnasium
 import numpy as np
 import pytest
-from drawing_here import needs_renderer
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from drawing_here import needs_renderer
 from midway.envs.registry import ENVIRONMENTS, make_vec
 from midway.envs.single import SingleGoalEnv
 from midway.types import ConfigurationError

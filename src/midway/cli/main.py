@@ -137,6 +137,7 @@ def evaluate(
     print(
         f"{run}: {task}, {actions} actions: success {result.success_rate:.1%} of {episodes} "
         f"episodes, {result.length:.1f} steps, {result.final_distance:.2f} m from the goal"
+        + (f" ({named})" if named else "")
     )
 
 
