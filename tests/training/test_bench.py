@@ -9,6 +9,7 @@ import numpy as np
 from midway.envs.push import IMAGE_SPEC
 from midway.replay import buffer
 from midway.training import api, bench, step
+from midway.training.compilation import give_back_memory
 from midway.training.folder import RunFolder
 
 MIB = 2**20
@@ -60,3 +61,14 @@ def test_noise_fills_the_replay() -> None:
     bench._fill_with_noise(training)
     assert int(buffer.num_transitions(training.replay)) > 1_000
     assert training.steps == training.config.train.random_steps
+
+
+def test_freed_memory_goes_back_to_the_system() -> None:
+    blocks = [bytearray(1_000) for _ in range(100_000)]
+    last = bytearray(1_000)
+    full, _ = bench.resident_bytes()
+    del blocks
+    give_back_memory()
+    now, _ = bench.resident_bytes()
+    assert full - now > 50 * MIB
+    assert len(last) == 1_000

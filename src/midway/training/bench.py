@@ -23,6 +23,7 @@ from midway.envs import registry as environments
 from midway.replay import buffer
 from midway.replay.storage import num_bytes
 from midway.training import api, loop, step
+from midway.training.compilation import give_back_memory
 from midway.training.folder import RunFolder
 from midway.types import EnvSpec
 
@@ -199,6 +200,7 @@ def memory(env: str, agent: str, batch: int, precision: str) -> Figures:
     training = filled(env, agent, batch, precision, 1, replay_capacity=rows)
     arguments = (training.arrays, training.totals, training.replay, jax.random.key(0), 0)
     jax.block_until_ready(training.learner.train(*arguments))
+    give_back_memory()  # as a run does when it logs
     size = num_bytes(training.replay)
     process, peak = resident_bytes()
     for array in jax.tree.leaves(training.replay):

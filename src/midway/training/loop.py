@@ -24,6 +24,7 @@ from midway.training import step as steps_of
 from midway.training.arrays import named_arrays, with_named_arrays
 from midway.training.checkpoint import Checkpoints
 from midway.training.collect import Collector
+from midway.training.compilation import give_back_memory
 from midway.training.devices import Devices
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.folder import RunConfig, RunFolder
@@ -268,10 +269,14 @@ def _clock(training: Training) -> dict[str, int | float]:
 
 
 def _log(training: Training, logger: Logger, reporter: Reporter, success: dict[str, float]) -> None:
-    """Write one row of metrics where there were updates, and say how far the run is."""
+    """Write one row of metrics where there were updates, and say how far the run is.
+
+    This is also a moment to give back memory: programs have been compiled since the last.
+    """
     values = training.metrics()
     if values:
         logger.metrics(training.steps, {**_clock(training), **values})
+    give_back_memory()
     speed = training.steps / max(training.seconds, 1e-9)
     reporter.advance(training.steps, {"steps/s": speed, **success})
 
