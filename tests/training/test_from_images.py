@@ -13,8 +13,6 @@ from drawing_here import needs_renderer
 from midway.envs.push import IMAGE_SPEC
 from midway.replay import buffer
 from midway.training import loop
-from midway.training.folder import RunFolder
-from midway.training.policy import load
 
 SMALL = {
     "hidden": (8, 8),
@@ -64,7 +62,7 @@ def test_exact_resume_with_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @needs_renderer
 def test_a_saved_policy_acts_on_images(tmp_path: Path) -> None:
     run = midway.train("push", seed=1, out=tmp_path / "run", changes=SMALL | {"steps": 30})
-    policy = load(RunFolder(run.path).path)
+    policy = midway.load(run.path)
     observation, _ = midway.make_vec("push", num_envs=2).reset(seed=0)
     actions = policy(observation["observation"], observation["desired_goal"])
     assert np.asarray(actions).shape == (2, 2)

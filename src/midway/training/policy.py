@@ -18,6 +18,7 @@ from midway.training import acting
 from midway.training.arrays import named_arrays, with_named_arrays
 from midway.training.evaluate import ActionKind
 from midway.training.folder import FORMAT, RunConfig, RunFolder, read_json, write_json
+from midway.training.step import create_state
 from midway.types import ConfigurationError, EnvSpec
 
 
@@ -122,7 +123,7 @@ def load(folder: RunFolder, spec: EnvSpec) -> Policy:
     description = read_json(folder.policy_config)
     config = RunConfig.from_json(description)
     agent = registry.get(config.agent)
-    state = agent.create(config.hyperparameters, spec, jax.random.key(0))
+    state = create_state(agent, config.hyperparameters, spec, jax.random.key(0))
     try:
         arrays = load_file(folder.policy_weights)
     except (OSError, SafetensorError) as error:
