@@ -1,47 +1,50 @@
-"""Measure what docs/performance.md shows: about six minutes on an idle machine.
+"""Measure what docs/performance.md shows: about twelve minutes on an idle machine.
 
-    python benchmarks/performance.py
+    python benchmarks/performance.py [PART...]
 
-Each figure comes from a process of its own, mostly ``midway bench``. All go to
-``benchmarks/results/speed/midway.json``; the tables are printed as Markdown.
+Each figure but the split of an update comes from a process of its own, mostly ``midway bench``. All
+go to ``benchmarks/results/speed/midway.json``; the tables are printed as Markdown.
 """
 
+import argparse
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import equinox as eqx
+import jax
+
+from midway.agents import ris
+from midway.replay import buffer
+from midway.training import bench as measures
 
 RESULTS = Path(__file__).parent / "results" / "speed" / "midway.json"
 ONE_CORE = ("taskset", "--cpu-list", "0")
 PRECISIONS = ("bf16", "f32")
 BATCHES = (256, 512, 1024, 2048, 4096)
 COPIES = (1, 8, 64, 256)
+PROCESSES = 3
+"""That measure each update."""
 
 
 def main() -> None:
-    """Measure, write and print everything."""
-    found: dict[str, Any] = {"machine": bench("env", "--env", "point-u")["machine"]}
-    found["update"] = [update("ant-u", b, p) for b in BATCHES for p in PRECISIONS]
-    found["update_one_core"] = [update("ant-u", b, "bf16", ONE_CORE) for b in (256, 2048)]
-    found["update_images"] = [update("push", 256, p) for p in PRECISIONS]
-    found["environment"] = [environment(n) for n in COPIES]
-    found["environment_one_core"] = [environment(64, ONE_CORE)]
-    arguments = ("--env", "ant-u", "--batch", "256", "--precision", "bf16")
-    found["loop"] = [bench("loop", *arguments)["loop"]]
-    found["memory"] = [
-        {"env": env, **bench("memory", "--env", env, "--precision", "bf16")["memory"]}
-        for env in ("ant-u", "push")
-    ]
-    found["start"] = starts()
-    RESULTS.write_text(json.dumps(found, indent=2) + "\n")
-    for name, rows in found.items():
-        if name != "machine":
-            print(f"\n{name}\n")
-            table(rows)
+    """Measure what is named, or everything; write and print it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
+    names = parser.parse_args().parts or list(PARTS)
+    found = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    found["machine"] = bench("env", "--env", "point-u")["machine"]
+    for name in names:
+        found[name] = PARTS[name]()
+        RESULTS.write_text(json.dumps(found, indent=2) + "\n")
+        print(f"\n{name}\n")
+        table(found[name])
 
 
 def bench(*arguments: str, prefix: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -53,16 +56,56 @@ def bench(*arguments: str, prefix: tuple[str, ...] = ()) -> dict[str, Any]:
 
 
 def update(env: str, batch: int, precision: str, prefix: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return the figures of one update of RIS."""
+    """Return the figures of one update of RIS: of several processes, the median one's."""
     arguments = ("--env", env, "--batch", str(batch), "--precision", precision)
-    figures = bench("update", *arguments, prefix=prefix)["update"]
-    return {"env": env, "batch": batch, "precision": precision, **figures}
+    found = [bench("update", *arguments, prefix=prefix)["update"] for _ in range(PROCESSES)]
+    median = sorted(found, key=lambda figures: figures["update_ms"])[PROCESSES // 2]
+    return {"env": env, "batch": batch, "precision": precision, **median}
 
 
 def environment(num_envs: int, prefix: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return how many steps copies of the ant take in a second."""
     arguments = ("--env", "ant-u", "--num-envs", str(num_envs))
     return {"num_envs": num_envs, **bench("env", *arguments, prefix=prefix)["env"]}
+
+
+def loops() -> list[dict[str, Any]]:
+    """Return the share of the loop that is spent in updates."""
+    arguments = ("--env", "ant-u", "--batch", "256", "--precision", "bf16")
+    return [bench("loop", *arguments)["loop"]]
+
+
+def memory(env: str) -> dict[str, Any]:
+    """Return what a run takes with a full replay."""
+    return {"env": env, **bench("memory", "--env", env, "--precision", "bf16")["memory"]}
+
+
+def split(batch: int) -> dict[str, Any]:
+    """Return how long the parts of one update of RIS take, each compiled alone (ms)."""
+    training = measures.filled("ant-u", "ris", batch, "bf16", updates_per_call=1)
+    state, spec, mix = training.state, training.spec, training.config.train.relabel
+    key = jax.random.key(0)
+    sample = jax.jit(lambda replay: buffer.sample(replay, spec, mix, batch, key))
+    drawn = sample(training.replay)
+    critics = eqx.filter_jit(ris.update_critic)
+    subgoal_policy = eqx.filter_jit(ris.update_subgoal_policy)
+    policy = eqx.filter_jit(ris.update_policy)
+    copies = eqx.filter_jit(ris.update_copies)
+    times = measures.medians(
+        {
+            "sample": lambda: sample(training.replay),
+            "critics": lambda: arrays(critics(state, drawn.observation, drawn, key)),
+            "subgoal_policy": lambda: arrays(subgoal_policy(state, drawn)),
+            "policy": lambda: arrays(policy(state, drawn, key, key)),
+            "copies": lambda: arrays(copies(state)),
+        }
+    )
+    return {"batch": batch, **times}
+
+
+def arrays(tree: Any) -> Any:
+    """Return the arrays of a tree, to wait for."""
+    return eqx.filter(tree, eqx.is_array)
 
 
 def starts() -> list[dict[str, Any]]:
@@ -103,6 +146,19 @@ def table(rows: list[dict[str, Any]]) -> None:
             f"{value:.4g}" if isinstance(value, float) else str(value) for value in row.values()
         ]
         print("| " + " | ".join(cells) + " |")
+
+
+PARTS: dict[str, Callable[[], list[dict[str, Any]]]] = {
+    "update": lambda: [update("ant-u", b, p) for b in BATCHES for p in PRECISIONS],
+    "update_one_core": lambda: [update("ant-u", b, "bf16", ONE_CORE) for b in (256, 2048)],
+    "update_images": lambda: [update("push", 256, p) for p in PRECISIONS],
+    "split": lambda: [split(batch) for batch in (256, 2048)],
+    "environment": lambda: [environment(n) for n in COPIES],
+    "environment_one_core": lambda: [environment(64, ONE_CORE)],
+    "loop": loops,
+    "memory": lambda: [memory(env) for env in ("ant-u", "push")],
+    "start": starts,
+}
 
 
 if __name__ == "__main__":
