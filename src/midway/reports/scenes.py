@@ -26,9 +26,6 @@ Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
 PIXELS = 100
 """Pixels per inch of a frame."""
 
-SUBGOALS = 20
-"""Imagined subgoals at each step."""
-
 SIDE = 2.6
 """Width of an image in a frame (inches)."""
 
@@ -111,7 +108,7 @@ class MazeScene:
 
     def __init__(self, maze: Maze, title: str, policy: Policy, recording: Recording) -> None:
         self._path = recording.achieved[:, POSITION]
-        self._subgoals = imagined(policy, recording)
+        self._subgoals = tabletop.in_every_state(policy, recording)
         self._kind = kind_of(recording)
         self._words = Words(policy, recording, unit=1.0)
         figure, (axes,) = maps.panels(maze, 1)
@@ -288,16 +285,6 @@ class Words:
 def kind_of(recording: Recording) -> str:
     """Return what the subgoals of an episode are, if there are any."""
     return "imagined" if recording.plans is None else "planned"
-
-
-def imagined(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I G"] | None:
-    """Return the subgoals in every state, imagined or planned; None if the agent has none."""
-    if recording.plans is not None:
-        return np.concatenate([recording.plans, recording.plans[-1:]])
-    if not imagination.imagines(policy.config.agent):
-        return None
-    goals = np.repeat(recording.goal[None], len(recording.observations), axis=0)
-    return imagination.subgoals(policy, recording.observations, goals, SUBGOALS)
 
 
 def decoding(folder: RunFolder, policy: Policy) -> Callable[[Recording], Images | None]:

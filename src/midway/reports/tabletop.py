@@ -121,6 +121,11 @@ def subgoals(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I 4"]
     """
     if policy.state.spec.is_image:
         return None
+    return in_every_state(policy, recording)
+
+
+def in_every_state(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I G"] | None:
+    """Return the subgoals in every state, imagined or planned; None if the agent has none."""
     if recording.plans is not None:
         return np.concatenate([recording.plans, recording.plans[-1:]])
     if not imagination.imagines(policy.config.agent):
