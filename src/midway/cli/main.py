@@ -1,45 +1,19 @@
-"""The command line: parses, wires, prints."""
+"""The command line: wires and prints."""
 
-import contextlib
 import dataclasses
-import functools
-import io
 import json
-import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
 from tyro.conf import Positional
-from tyro.constructors import PrimitiveConstructorSpec
 
+from midway.cli.parsing import Count, OptionalCount, parse, settings
 from midway.types import ConfigurationError, NonFiniteError
 
 EXIT_FAILED = 1
 EXIT_USAGE = 2
-
-
-def _whole_number(words: list[str]) -> int:
-    """Read 50000, 50_000 or 5e4."""
-    number = float(words[0].replace("_", ""))
-    if not number.is_integer():
-        raise ValueError(f"{words[0]} is not a whole number")
-    return int(number)
-
-
-_NUMBER = PrimitiveConstructorSpec[Any](
-    nargs=1,
-    metavar="N",
-    instance_from_str=_whole_number,
-    is_instance=lambda value: value is None or isinstance(value, int),
-    str_from_instance=lambda value: [str(value)],
-)
-Count = Annotated[int, _NUMBER]
-"""A whole number, which may be written 1e6 or 1_000_000."""
-OptionalCount = Annotated[int | None, _NUMBER]
-"""A whole number, or what the preset or the run says."""
 
 
 def train(
@@ -77,7 +51,7 @@ def train(
         num_envs=num_envs,
         out=out,
         precision=precision,
-        changes=_changes(set),
+        changes=settings(set),
         progress=True,
     )
     _say_where(run)
@@ -170,7 +144,7 @@ def sweep(
     from midway.cluster import sweep as sweeps
     from midway.training import api
 
-    changes = _changes(set) | ({} if steps is None else {"steps": steps})
+    changes = settings(set) | ({} if steps is None else {"steps": steps})
     for env in envs:
         for agent in agents:
             api.configure(env, agent, preset, changes=changes)
@@ -325,7 +299,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command; exit with 0, 1 (failed while running) or 2 (wrong use)."""
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        command = _parse(arguments)
+        command = parse(COMMANDS, arguments)
         from midway.training.compilation import use_compilation_cache
 
         use_compilation_cache()
@@ -341,61 +315,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _fail(EXIT_FAILED, error)
 
 
-def _parse(arguments: Sequence[str]) -> Callable[[], None]:
-    """Return the command with its arguments; a wrong one becomes one clear line."""
-    errors = io.StringIO()
-    delayed = {name: _delay(command) for name, command in COMMANDS.items()}
-    try:
-        with contextlib.redirect_stderr(errors):
-            command: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(
-                delayed,
-                prog="midway",
-                description="Goal-conditioned reinforcement learning with imagined subgoals.",
-                args=arguments,
-            )
-        return command
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        raise ConfigurationError(_one_line(errors.getvalue())) from None
-
-
-def _delay(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-    """Return a function of the same signature that only binds its arguments.
-
-    Parsing and running stay apart, so that only messages of the parser are caught.
-    """
-
-    @functools.wraps(command)
-    def bind(*args: Any, **kwargs: Any) -> Callable[[], None]:
-        return functools.partial(command, *args, **kwargs)
-
-    return bind
-
-
-def _one_line(box: str) -> str:
-    """Return the text of the parser's box without its frame and its hint at --help."""
-    lines = [line.strip("│╭╮╰╯ \n") for line in box.splitlines()]
-    text = " ".join(line for line in lines[1:] if line.strip("─"))
-    text = re.split(r"For full helptext|Argument helptext|Perhaps you meant", text)[0]
-    return f"{' '.join(text.split())} (see midway --help)"
-
-
 def _fail(status: int, error: object) -> None:
     text = " ".join(str(error).split())
     print(f"midway: {text}", file=sys.stderr)
     sys.exit(status)
-
-
-def _changes(words: Sequence[str]) -> dict[str, str]:
-    """Return the settings of ``--set NAME=VALUE ...``."""
-    changes = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not equals:
-            raise ConfigurationError(f"--set {word!r}: write NAME=VALUE")
-        changes[name.replace("-", "_")] = value
-    return changes
 
 
 def _run_folders(paths: Sequence[Path]) -> list[Path]:

@@ -1,0 +1,95 @@
+"""What users type: numbers, settings and commands, with one clear line for what is wrong."""
+
+import contextlib
+import functools
+import io
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any
+
+import tyro
+from tyro.constructors import PrimitiveConstructorSpec
+
+from midway.types import ConfigurationError
+
+
+def _whole_number(words: list[str]) -> int:
+    """Read 50000, 50_000 or 5e4."""
+    number = float(words[0].replace("_", ""))
+    if not number.is_integer():
+        raise ValueError(f"{words[0]} is not a whole number")
+    return int(number)
+
+
+_NUMBER = PrimitiveConstructorSpec[Any](
+    nargs=1,
+    metavar="N",
+    instance_from_str=_whole_number,
+    is_instance=lambda value: value is None or isinstance(value, int),
+    str_from_instance=lambda value: [str(value)],
+)
+Count = Annotated[int, _NUMBER]
+"""A whole number, which may be written 1e6 or 1_000_000."""
+OptionalCount = Annotated[int | None, _NUMBER]
+"""A whole number, or what the preset or the run says."""
+
+
+def parse(
+    commands: Mapping[str, Callable[..., None]], arguments: Sequence[str]
+) -> Callable[[], None]:
+    """Return the command with its arguments.
+
+    Raises:
+        ConfigurationError: A wrong command or argument.
+    """
+    errors = io.StringIO()
+    delayed = {name: _delay(command) for name, command in commands.items()}
+    try:
+        with contextlib.redirect_stderr(errors):
+            command: Callable[[], None] = tyro.extras.subcommand_cli_from_dict(
+                delayed,
+                prog="midway",
+                description="Goal-conditioned reinforcement learning with imagined subgoals.",
+                args=arguments,
+            )
+        return command
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise ConfigurationError(_one_line(errors.getvalue())) from None
+
+
+def _delay(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """Return a function of the same signature that only binds its arguments.
+
+    Parsing and running stay apart, so that only messages of the parser are caught.
+    """
+
+    @functools.wraps(command)
+    def bind(*args: Any, **kwargs: Any) -> Callable[[], None]:
+        return functools.partial(command, *args, **kwargs)
+
+    return bind
+
+
+def _one_line(box: str) -> str:
+    """Return the text of the parser's box without its frame and its hint at --help."""
+    lines = [line.strip("│╭╮╰╯ \n") for line in box.splitlines()]
+    text = " ".join(line for line in lines[1:] if line.strip("─"))
+    text = re.split(r"For full helptext|Argument helptext|Perhaps you meant", text)[0]
+    return f"{' '.join(text.split())} (see midway --help)"
+
+
+def settings(words: Sequence[str]) -> dict[str, str]:
+    """Return the settings of ``--set NAME=VALUE ...``.
+
+    Raises:
+        ConfigurationError: A word without a value.
+    """
+    changes = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals:
+            raise ConfigurationError(f"--set {word!r}: write NAME=VALUE")
+        changes[name.replace("-", "_")] = value
+    return changes
