@@ -88,6 +88,8 @@ class EnvSpec:
         state_shape: Shape of ``achieved_state`` where success is measured on a state that the
             networks never see; ``None`` where it is measured on the goals.
         task: The definition of success.
+        origin: Middle of the states, nothing for zeros; only where goals are observations.
+        unit: What networks count in: of a state, they read (state - origin) / unit.
     """
 
     name: str
@@ -99,6 +101,8 @@ class EnvSpec:
     goal_is_observation: bool
     state_shape: tuple[int, ...] | None
     task: GoalTask
+    origin: tuple[float, ...] = ()
+    unit: float = 1.0
 
     @property
     def is_image(self) -> bool:

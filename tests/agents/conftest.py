@@ -93,3 +93,9 @@ def pairs() -> Case:
 def sac_case() -> Case:
     """SAC with goals that are no observations."""
     return make_case("sac", "pairs")
+
+
+@pytest.fixture(params=["ris", "sac"])
+def state_case(request: pytest.FixtureRequest) -> Case:
+    """Each agent where goals are observations."""
+    return make_case(request.param, "states")

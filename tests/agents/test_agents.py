@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from midway.agents import registry, ris, sac
-from midway.types import ConfigurationError
+from midway.types import ConfigurationError, Subgoal
 
 KEY = jax.random.key(7)
 
@@ -52,6 +52,8 @@ def test_defaults_are_table_1_for_ant_navigation():
         "policy_learning_rate": 1e-3,
         "subgoal_learning_rate": 1e-4,
         "encoder_learning_rate": 1e-4,
+        "image_translation": 8,
+        "image_pooling": 1,
         "kl_weight": 0.1,
         "advantage_temperature": 0.1,
         "num_subgoals": 10,
@@ -235,3 +237,26 @@ def test_update_refuses_wrong_shapes(case):
     batch = case.batch._replace(goal=case.batch.goal[:-1])
     with pytest.raises(TypeError):
         eqx.filter_eval_shape(case.agent.update, case.state, batch, KEY)
+
+
+def test_states_in_another_unit_make_the_same_update(state_case):
+    case = state_case
+    origin, unit = (0.5, -1.0, 2.0, 0.0), 0.125
+
+    def in_metres(code):
+        return code * unit + jnp.asarray(origin)
+
+    batch = case.batch._replace(
+        observation=in_metres(case.batch.observation),
+        next_observation=in_metres(case.batch.next_observation),
+        goal=in_metres(case.batch.goal),
+        subgoal_candidate=Subgoal(*map(in_metres, case.batch.subgoal_candidate)),
+    )
+    spec = replace(case.spec, origin=origin, unit=unit)
+    state = case.agent.create(case.state.config, spec, jax.random.key(0))
+    after, metrics = case.update(state, batch, KEY)
+    expected, expected_metrics = case.update(case.state, case.batch, KEY)
+    for found, wanted in zip(arrays(after.policy), arrays(expected.policy), strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-4)
+    for key, wanted in expected_metrics.items():
+        np.testing.assert_allclose(metrics[key], wanted, rtol=1e-3, atol=1e-4)

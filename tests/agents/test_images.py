@@ -83,7 +83,7 @@ def test_the_encoder_is_trained_by_the_critics_loss_of_the_current_image_alone(n
 def test_candidates_are_the_codes_of_other_observations():
     ris, state = made("ris")
     code = state.encoder(drawn().observation)
-    candidate = ris.subgoal_candidates(SPEC, drawn(), code)
+    candidate = ris.subgoal_candidates(state.encoder, drawn(), code)
     np.testing.assert_array_equal(candidate.observation[1:], code[:-1])
     np.testing.assert_array_equal(candidate.observation[0], code[-1])
     np.testing.assert_array_equal(candidate.achieved_goal, candidate.observation)

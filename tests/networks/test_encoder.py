@@ -1,5 +1,7 @@
 """Encoders: sizes and start of appendix B, translation, and what the codes depend on."""
 
+from dataclasses import dataclass, replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,10 +9,23 @@ import numpy as np
 import pytest
 
 from midway.networks import encoder as encoders
-from midway.networks.encoder import CODE_SIZE, MARGIN
-from midway.types import Batch, DistanceTask, EnvSpec, Subgoal
+from midway.networks.encoder import CODE_SIZE
+from midway.networks.mlp import Precision
+from midway.types import Batch, ConfigurationError, DistanceTask, EnvSpec, Subgoal
 
 KEY = jax.random.key(0)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Appendix B."""
+
+    image_translation: int = 8
+    image_pooling: int = 1
+    precision: Precision = "f32"
+
+
+CONFIG = Config()
 IMAGE = (84, 84, 3)
 TASK = DistanceTask(((0, 1),), 0.5)
 IMAGES = EnvSpec("images", IMAGE, "uint8", IMAGE, 2, 50, True, (4,), TASK)
@@ -23,7 +38,7 @@ def pictures(count, seed=0):
 
 @pytest.fixture(scope="module")
 def encoder():
-    return encoders.create(IMAGES, "f32", KEY)
+    return encoders.create(IMAGES, CONFIG, KEY)
 
 
 def test_layers_are_those_of_the_appendix(encoder):
@@ -67,9 +82,9 @@ def test_translation_moves_each_image_by_the_offset_drawn_for_it(encoder):
     moved = encoder.augment(images, KEY)
     assert moved.shape == images.shape
     assert moved.dtype == jnp.uint8
-    corners = np.asarray(jax.random.randint(KEY, (32, 2), 0, 2 * MARGIN + 1))
+    corners = np.asarray(jax.random.randint(KEY, (32, 2), 0, 17))
     assert corners.min() == 0
-    assert corners.max() == 2 * MARGIN
+    assert corners.max() == 16
     framed = np.pad(images, ((0, 0), (8, 8), (8, 8), (0, 0)))
     for image, frame, (row, column) in zip(moved, framed, corners, strict=True):
         np.testing.assert_array_equal(image, frame[row : row + 84, column : column + 84])
@@ -77,9 +92,19 @@ def test_translation_moves_each_image_by_the_offset_drawn_for_it(encoder):
 
 
 def test_states_are_their_own_codes():
-    encoder = encoders.create(STATES, "f32", KEY)
+    encoder = encoders.create(STATES, CONFIG, KEY)
     states = jax.random.normal(KEY, (3, 5))
     np.testing.assert_array_equal(encoder(encoder.augment(states, KEY)), states)
+    np.testing.assert_array_equal(encoder.states(states), states)
+
+
+def test_states_are_read_from_the_origin_in_the_unit_of_the_environment():
+    spec = replace(STATES, origin=(1.0, 2.0, 0.0, 0.0, -1.0), unit=0.1)
+    encoder = encoders.create(spec, CONFIG, KEY)
+    states = jnp.array([[1.1, 2.0, 0.3, 0.0, -1.5]])
+    codes = encoder(states)
+    np.testing.assert_allclose(codes, [[1.0, 0.0, 3.0, 0.0, -5.0]], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(encoder.states(codes), states, rtol=1e-6, atol=1e-7)
 
 
 def batch_of_pictures():
@@ -108,3 +133,35 @@ def test_fixed_codes_have_no_gradient_and_the_observation_stays_an_image(encoder
         return (codes.goal**2 + codes.next_observation**2).sum()
 
     assert not any(leaf.any() for leaf in jax.tree.leaves(gradient(encoder)))
+
+
+def test_pooling_averages_squares_of_pixels():
+    image = jax.random.uniform(KEY, (2, 6, 4, 3))
+    found = encoders.pooled(image, 2)
+    assert found.shape == (2, 3, 2, 3)
+    np.testing.assert_allclose(found[1, 2, 1], image[1, 4:6, 2:4].mean((0, 1)), rtol=1e-5)
+    np.testing.assert_array_equal(encoders.pooled(image, 1), image)
+
+
+def test_codes_of_pooled_images_do_not_see_what_averages_out():
+    encoder = encoders.create(IMAGES, replace(CONFIG, image_pooling=2), KEY)
+    checks = jnp.indices((84, 84)).sum(0) % 2 * 255
+    checkered = jnp.broadcast_to(checks[None, :, :, None], (1, *IMAGE)).astype(jnp.uint8)
+    np.testing.assert_allclose(encoder(checkered), encoder(255 - checkered), rtol=1e-5)
+    assert encoder(checkered).shape == (1, CODE_SIZE)
+
+
+@pytest.mark.parametrize("pooling", [0, 3, 5])
+def test_pooling_that_leaves_no_image_is_refused(pooling):
+    with pytest.raises(
+        ConfigurationError, match=f"image_pooling {pooling}: must divide .* 84 x 84"
+    ):
+        encoders.create(IMAGES, replace(CONFIG, image_pooling=pooling), KEY)
+
+
+def test_no_translation_leaves_images_as_they_are():
+    encoder = encoders.create(IMAGES, replace(CONFIG, image_translation=0), KEY)
+    images = pictures(3)
+    np.testing.assert_array_equal(encoder.augment(images, KEY), images)
+    with pytest.raises(ConfigurationError, match="image_translation -1: must not be below 0"):
+        encoders.create(IMAGES, replace(CONFIG, image_translation=-1), KEY)

@@ -16,7 +16,7 @@ from midway import functional
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
 from midway.networks.critics import TwinCritic
-from midway.networks.encoder import Encoder
+from midway.networks.encoder import Encoder, StateEncoder
 from midway.networks.mlp import Precision
 from midway.networks.policies import GaussianPolicy, SubgoalPolicy
 from midway.types import Batch, EnvSpec, Metrics, Subgoal
@@ -34,6 +34,8 @@ class Config:
         policy_learning_rate: Adam's rate for the policy.
         subgoal_learning_rate: Adam's rate for the subgoal policy.
         encoder_learning_rate: Adam's rate for the image encoder (original code).
+        image_translation: Largest random translation of an image along each axis (pixels).
+        image_pooling: Side of the squares of pixels that the encoder averages first (ours).
         kl_weight: α, the weight of the KL divergence to the prior.
         advantage_temperature: λ, of the weights of subgoal candidates.
         num_subgoals: I, subgoals imagined for the prior (eq. 18).
@@ -48,6 +50,8 @@ class Config:
     policy_learning_rate: float = 1e-3
     subgoal_learning_rate: float = 1e-4
     encoder_learning_rate: float = 1e-4
+    image_translation: int = 8
+    image_pooling: int = 1
     kl_weight: float = 0.1
     advantage_temperature: float = 0.1
     num_subgoals: int = 10
@@ -99,14 +103,14 @@ def as_vector(spec: EnvSpec, subgoal: Subgoal) -> Float[Array, "*B S"]:
     return jnp.concatenate(subgoal, axis=-1)
 
 
-def subgoal_candidates(spec: EnvSpec, batch: Batch, code: Float[Array, "B S"]) -> Subgoal:
-    """Return the states drawn from replay as candidates (eq. 17); of images, their codes.
+def subgoal_candidates(encoder: Encoder, batch: Batch, code: Float[Array, "B S"]) -> Subgoal:
+    """Return the codes of the states drawn from replay as candidates (eq. 17).
 
     For images these are the codes of the batch's own observations, each beside another transition:
     they are as uniform draws from replay as any, and need no further pass through the encoder.
     """
-    if not spec.is_image:
-        return batch.subgoal_candidate
+    if isinstance(encoder, StateEncoder):
+        return Subgoal(*map(encoder, batch.subgoal_candidate))
     shifted = jnp.roll(code, 1, axis=0)
     return Subgoal(shifted, shifted)
 
@@ -216,7 +220,7 @@ def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metr
     observation, batch = encoders.encode_fixed(state.encoder, batch, encoding_key)
     state, code, critic_metrics = update_critic(state, observation, batch, target_key)
     batch = batch._replace(
-        observation=code, subgoal_candidate=subgoal_candidates(state.spec, batch, code)
+        observation=code, subgoal_candidate=subgoal_candidates(state.encoder, batch, code)
     )
     state, subgoal_metrics = update_subgoal_policy(state, batch)
     state, policy_metrics = update_policy(state, batch, subgoal_key, action_key)
@@ -316,7 +320,7 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     observation_size, goal_size = encoders.code_sizes(spec)
     subgoal_size = observation_size if spec.goal_is_observation else observation_size + goal_size
     pair = observation_size + goal_size
-    encoder = encoders.create(spec, config.precision, encoder_key)
+    encoder = encoders.create(spec, config, encoder_key)
     critic = TwinCritic(pair + spec.action_dim, config.hidden, config.precision, key=critic_key)
     subgoal_policy = SubgoalPolicy(
         pair, subgoal_size, config.hidden, config.precision, key=subgoal_key

@@ -35,6 +35,8 @@ class Config:
         policy_learning_rate: Adam's rate for the policy.
         entropy_learning_rate: Adam's rate for the logarithm of the entropy coefficient.
         encoder_learning_rate: Adam's rate for the image encoder.
+        image_translation: Largest random translation of an image along each axis (pixels).
+        image_pooling: Side of the squares of pixels that the encoder averages first (ours).
         precision: Products in ``f32`` or ``bf16``; everything else is float32.
     """
 
@@ -45,6 +47,8 @@ class Config:
     policy_learning_rate: float = 1e-3
     entropy_learning_rate: float = 1e-3
     encoder_learning_rate: float = 1e-4
+    image_translation: int = 8
+    image_pooling: int = 1
     precision: Precision = "f32"
 
 
@@ -209,7 +213,7 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     """Return networks at their random start; the target critics equal the critics."""
     encoder_key, critic_key, policy_key = jax.random.split(key, 3)
     pair = sum(encoders.code_sizes(spec))
-    encoder = encoders.create(spec, config.precision, encoder_key)
+    encoder = encoders.create(spec, config, encoder_key)
     critic = TwinCritic(pair + spec.action_dim, config.hidden, config.precision, key=critic_key)
     policy = GaussianPolicy(pair, spec.action_dim, config.hidden, config.precision, key=policy_key)
     log_entropy_coefficient = jnp.zeros(())

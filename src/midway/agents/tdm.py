@@ -42,6 +42,8 @@ class Config:
         critic_learning_rate: Adam's rate for the critics.
         policy_learning_rate: Adam's rate for the policy.
         encoder_learning_rate: Adam's rate for the image encoder.
+        image_translation: Largest random translation of an image along each axis (pixels).
+        image_pooling: Side of the squares of pixels that the encoder averages first (ours).
         target_noise: Standard deviation of the noise on target actions.
         target_noise_bound: Bound of that noise.
         saturation_weight: Weight of the cost of actions far in the tails of tanh.
@@ -60,6 +62,8 @@ class Config:
     critic_learning_rate: float = 1e-3
     policy_learning_rate: float = 1e-3
     encoder_learning_rate: float = 1e-4
+    image_translation: int = 8
+    image_pooling: int = 1
     target_noise: float = 0.2
     target_noise_bound: float = 0.5
     saturation_weight: float = 1.0
@@ -315,7 +319,7 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
         new = MLP(in_size, config.hidden, out_size, config.precision, key=key)
         return with_small_output(new, OUTPUT_BOUND)
 
-    encoder = encoders.create(spec, config.precision, encoder_key)
+    encoder = encoders.create(spec, config, encoder_key)
     critic_inputs = inputs + spec.action_dim
     first, second = (network(critic_inputs, num_rewards, k) for k in (first_key, second_key))
     critic = (first, second)

@@ -53,6 +53,8 @@ STATE_SPEC = EnvSpec(
     goal_is_observation=True,
     state_shape=None,
     task=DistanceTask(((0, 1), (2, 3)), GOAL_THRESHOLD, names=("hand", "puck")),
+    origin=(TABLE.x, TABLE.y) * 2,
+    unit=0.1,  # in metres, centimetres that matter are lost beside the biases of the first layers
 )
 
 IMAGE_SPEC = replace(
@@ -62,6 +64,8 @@ IMAGE_SPEC = replace(
     observation_dtype="uint8",
     goal_shape=IMAGE_BOX.shape,
     state_shape=(4,),
+    origin=(),
+    unit=1.0,
 )
 
 POSITIONS = mujoco.mjtStage.mjSTAGE_POS.value

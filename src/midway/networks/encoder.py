@@ -1,6 +1,6 @@
 """From observations to the codes that policies and critics read."""
 
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Key, Shaped, UInt8
 from midway.networks.convolution import Filter, in_blocks
 from midway.networks.initialization import with_centre_tap, with_orthogonal_weight
 from midway.networks.mlp import Linear, Precision
-from midway.types import Batch, EnvSpec
+from midway.types import Batch, ConfigurationError, EnvSpec
 
 CODE_SIZE = 16
 """Numbers of an image's code (appendix B)."""
@@ -19,16 +19,46 @@ CHANNELS = 32
 STRIDES = (2, 2, 2, 1)
 """Of the four 3 x 3 convolutions (appendix B)."""
 
-MARGIN = 8
-"""Black pixels around an image before the random crop: 84 + 2 * 8 = 100 (appendix B)."""
+SMALLEST_IMAGE = 31
+"""Rows and columns that the convolutions make one pixel of."""
+
+
+class EncoderConfig(Protocol):
+    """What an encoder needs of an agent's configuration.
+
+    Attributes:
+        image_translation: Largest random translation of an image along each axis (pixels).
+        image_pooling: Side of the squares of pixels that are averaged before the convolutions.
+        precision: Of products.
+    """
+
+    @property
+    def image_translation(self) -> int: ...
+
+    @property
+    def image_pooling(self) -> int: ...
+
+    @property
+    def precision(self) -> Precision: ...
 
 
 class StateEncoder(eqx.Module):
-    """The identity: a state is its own code."""
+    """States relative to the environment's origin, in its unit: the state itself in most."""
+
+    origin: tuple[float, ...] = eqx.field(static=True)
+    unit: float = eqx.field(static=True)
 
     def __call__(self, observation: Float[Array, "B S"]) -> Float[Array, "B S"]:
-        """Return the observation."""
-        return observation
+        """Return (state - origin) / unit."""
+        return (observation - self._shift) / self.unit
+
+    def states(self, code: Float[Array, "*B S"]) -> Float[Array, "*B S"]:
+        """Return the states that codes stand for, in the units of the environment."""
+        return code * self.unit + self._shift
+
+    @property
+    def _shift(self) -> Float[Array, "..."]:
+        return jnp.asarray(self.origin) if self.origin else jnp.zeros(())
 
     def augment(self, observation: Float[Array, "B S"], key: Key[Array, ""]) -> Float[Array, "B S"]:
         """Return the observation: states are not augmented."""
@@ -44,19 +74,23 @@ class ImageEncoder(eqx.Module):
 
     convolutions: tuple[Filter, ...]
     linear: Linear
+    translation: int = eqx.field(static=True)
+    pooling: int = eqx.field(static=True)
 
     def __init__(
-        self, image_shape: tuple[int, ...], precision: Precision, *, key: Key[Array, ""]
+        self, image_shape: tuple[int, ...], config: EncoderConfig, *, key: Key[Array, ""]
     ) -> None:
+        self.translation, self.pooling = config.image_translation, config.image_pooling
         keys = jax.random.split(key, len(STRIDES) + 1)
-        height, width, channels = image_shape
+        height, width = (side // self.pooling for side in image_shape[:2])
+        channels = image_shape[2]
         layers = []
         for stride, layer_key in zip(STRIDES, keys[:-1], strict=True):
-            layer = Filter(3, stride, channels, CHANNELS, precision, key=layer_key)
+            layer = Filter(3, stride, channels, CHANNELS, config.precision, key=layer_key)
             layers.append(with_centre_tap(layer, layer_key))
             height, width = (height - 3) // stride + 1, (width - 3) // stride + 1
             channels = CHANNELS
-        linear = Linear(height * width * channels, CODE_SIZE, precision, key=keys[-1])
+        linear = Linear(height * width * channels, CODE_SIZE, config.precision, key=keys[-1])
         self.convolutions = tuple(layers)
         self.linear = with_orthogonal_weight(linear, keys[-1])
 
@@ -64,7 +98,7 @@ class ImageEncoder(eqx.Module):
         """Return the codes of images."""
 
         def codes(image: UInt8[Array, "b H W 3"]) -> Float[Array, "b 16"]:
-            x = image.astype(jnp.float32) / 255
+            x = pooled(image.astype(jnp.float32) / 255, self.pooling)
             for layer in self.convolutions:
                 x = jax.nn.relu(layer.reduce(x))
             return self.linear(x.reshape(len(x), -1))
@@ -72,12 +106,17 @@ class ImageEncoder(eqx.Module):
         found: Float[Array, "B 16"] = in_blocks(codes, image)
         return found
 
+    def states(self, code: Float[Array, "*B 16"]) -> Float[Array, "*B 16"]:
+        """Return the codes: they are not decoded here."""
+        return code
+
     def augment(
         self, image: UInt8[Array, "B H W 3"], key: Key[Array, ""]
     ) -> UInt8[Array, "B H W 3"]:
-        """Return each image moved by offsets of its own, up to 8 pixels, with a black rim."""
-        framed = jnp.pad(image, ((0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0)))
-        corners = jax.random.randint(key, (len(image), 2), 0, 2 * MARGIN + 1)
+        """Return each image moved by offsets of its own, with a black rim (appendix B)."""
+        rim = self.translation
+        framed = jnp.pad(image, ((0, 0), (rim, rim), (rim, rim), (0, 0)))
+        corners = jax.random.randint(key, (len(image), 2), 0, 2 * rim + 1)
 
         def crop(framed: UInt8[Array, "..."], corner: Shaped[Array, "2"]) -> UInt8[Array, "..."]:
             return jax.lax.dynamic_slice(framed, (*corner, 0), image.shape[1:])
@@ -86,14 +125,34 @@ class ImageEncoder(eqx.Module):
         return moved
 
 
+def pooled(image: Float[Array, "B H W C"], side: int) -> Float[Array, "B h w C"]:
+    """Return the means of squares of pixels."""
+    batch, height, width, channels = image.shape
+    squares = image.reshape(batch, height // side, side, width // side, side, channels)
+    return squares.mean((2, 4))
+
+
 Encoder: TypeAlias = StateEncoder | ImageEncoder
 
 
-def create(spec: EnvSpec, precision: Precision, key: Key[Array, ""]) -> Encoder:
-    """Return the encoder that suits the environment's observations."""
+def create(spec: EnvSpec, config: EncoderConfig, key: Key[Array, ""]) -> Encoder:
+    """Return the encoder that suits the environment's observations.
+
+    Raises:
+        ConfigurationError: A translation below 0, or squares to average that do not tile images.
+    """
     if spec.is_image:
-        return ImageEncoder(spec.observation_shape, precision, key=key)
-    return StateEncoder()
+        translation, pooling = config.image_translation, config.image_pooling
+        if translation < 0:
+            raise ConfigurationError(f"image_translation {translation}: must not be below 0")
+        sides = spec.observation_shape[:2]
+        if pooling < 1 or any(s % pooling or s // pooling < SMALLEST_IMAGE for s in sides):
+            raise ConfigurationError(
+                f"image_pooling {pooling}: must divide images of {sides[0]} x {sides[1]} pixels "
+                f"and leave {SMALLEST_IMAGE}"
+            )
+        return ImageEncoder(spec.observation_shape, config, key=key)
+    return StateEncoder(spec.origin, spec.unit)
 
 
 def code_sizes(spec: EnvSpec) -> tuple[int, int]:

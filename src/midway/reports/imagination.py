@@ -112,7 +112,8 @@ def values(policy: Policy, observation: Array, goal: Array) -> Array:
 @eqx.filter_jit
 def _distribution(state: Any, observation: Any, goal: Any) -> tuple[Any, Any]:
     subgoals = state.subgoal_policy(state.encoder(observation), state.encoder(goal))
-    return subgoals.location, jax.numpy.exp(subgoals.log_scale)
+    location = state.encoder.states(subgoals.location)
+    return location, state.spec.unit * jax.numpy.exp(subgoals.log_scale)
 
 
 @eqx.filter_jit
