@@ -106,10 +106,10 @@ def segment_steps(config: Config, spec: EnvSpec) -> int:
 
 
 def codes(state: State, observation: Shaped[Array, "*B"]) -> Float[Array, "..."]:
-    """Return what the TDM reads: states themselves, or the latent means of images."""
+    """Return what the TDM reads: states in its units, or the latent means of images."""
     if state.spec.is_image:
         return state.vae.encode(observation).mean
-    return observation.astype(jnp.float32)
+    return state.encoder(observation.astype(jnp.float32))
 
 
 def subgoal_codes(state: State, latent: Float[Array, "*B L"]) -> Subgoal:
@@ -121,6 +121,7 @@ def subgoal_codes(state: State, latent: Float[Array, "*B L"]) -> Subgoal:
     decoded = state.vae.decode(latent)
     if state.spec.is_image:
         decoded = state.vae.encode(decoded).mean
+    decoded = state.encoder(decoded)
     if state.spec.goal_is_observation:
         return Subgoal(decoded, decoded)
     size = state.spec.observation_shape[0]
@@ -216,12 +217,13 @@ def plan_where_due(
 
 def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
     """Return the state after one update of the TDM; the autoencoder stays as it is."""
-    coded = batch._replace(
-        observation=codes(state, batch.observation),
-        next_observation=codes(state, batch.next_observation),
-        goal=codes(state, batch.goal),
-    )
-    return tdm.update(state, coded, key)
+    if state.spec.is_image:
+        batch = batch._replace(
+            observation=codes(state, batch.observation),
+            next_observation=codes(state, batch.next_observation),
+            goal=codes(state, batch.goal),
+        )
+    return tdm.update(state, batch, key)
 
 
 def pretraining(config: Config) -> Pretraining:

@@ -1,6 +1,6 @@
 """From observations to the codes that policies and critics read."""
 
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -23,23 +23,21 @@ SMALLEST_IMAGE = 31
 """Rows and columns that the convolutions make one pixel of."""
 
 
+@runtime_checkable
 class EncoderConfig(Protocol):
-    """What an encoder needs of an agent's configuration.
-
-    Attributes:
-        image_translation: Largest random translation of an image along each axis (pixels).
-        image_pooling: Side of the squares of pixels that are averaged before the convolutions.
-        precision: Of products.
-    """
+    """What an encoder needs of an agent's configuration."""
 
     @property
-    def image_translation(self) -> int: ...
+    def image_translation(self) -> int:
+        """Largest random translation of an image along each axis (pixels)."""
 
     @property
-    def image_pooling(self) -> int: ...
+    def image_pooling(self) -> int:
+        """Side of the squares of pixels that are averaged before the convolutions."""
 
     @property
-    def precision(self) -> Precision: ...
+    def precision(self) -> Precision:
+        """Factors of products are rounded to it."""
 
 
 class StateEncoder(eqx.Module):

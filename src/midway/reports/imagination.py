@@ -56,7 +56,7 @@ def first_plan(policy: Policy, observation: Array, goal: Array) -> Array:
 
 @eqx.filter_jit
 def _plan(agent: Any, state: Any, memory: Any) -> Any:
-    return agent.subgoal_codes(state, memory.latents).achieved_goal
+    return state.encoder.states(agent.subgoal_codes(state, memory.latents).achieved_goal)
 
 
 def distribution(policy: Policy, observation: Array, goal: Array) -> tuple[Array, Array]:
