@@ -23,6 +23,7 @@ import jax
 from midway.agents import ris
 from midway.replay import buffer
 from midway.training import bench as measures
+from midway.training import bench_plan
 
 RESULTS = Path(__file__).parent / "results" / "speed" / "midway.json"
 ONE_CORE = ("taskset", "--cpu-list", "0")
@@ -103,6 +104,17 @@ def split(batch: int) -> dict[str, Any]:
     return {"batch": batch, **times}
 
 
+def plans() -> list[dict[str, Any]]:
+    """Return the seconds of a plan of LEAP: as published, and with fewer samples and subgoals."""
+    sizes = [("bf16", 10_000, 11), ("f32", 10_000, 11)]
+    sizes += [("bf16", 10_000, subgoals) for subgoals in (5, 2)]
+    sizes += [("bf16", samples, 11) for samples in (5_000, 2_500, 1_000)]
+    return [
+        {"precision": precision, **bench_plan.plan("ant-u", precision, samples, subgoals)}
+        for precision, samples, subgoals in sizes
+    ]
+
+
 def arrays(tree: Any) -> Any:
     """Return the arrays of a tree, to wait for."""
     return eqx.filter(tree, eqx.is_array)
@@ -158,6 +170,7 @@ PARTS: dict[str, Callable[[], list[dict[str, Any]]]] = {
     "loop": loops,
     "memory": lambda: [memory(env) for env in ("ant-u", "push")],
     "start": starts,
+    "plan": plans,
 }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from midway.envs.push import IMAGE_SPEC
 from midway.replay import buffer
-from midway.training import api, bench, step
+from midway.training import api, bench, bench_plan, step
 from midway.training.compilation import give_back_memory
 from midway.training.folder import RunFolder
 
@@ -72,3 +72,9 @@ def test_freed_memory_goes_back_to_the_system() -> None:
     now, _ = bench.resident_bytes()
     assert full - now > 50 * MIB
     assert len(last) == 1_000
+
+
+def test_a_plan_is_timed_with_the_sizes_asked_for() -> None:
+    found = bench_plan.plan("point-u", "f32", samples=32, subgoals=2)
+    assert (found["samples"], found["iterations"], found["subgoals"]) == (32, 50, 2)
+    assert found["plan_s"] > 0

@@ -205,7 +205,7 @@ def watch(
 
 
 def bench(
-    what: Positional[Literal["all", "update", "env", "replay", "loop", "memory"]] = "all",
+    what: Positional[Literal["all", "update", "env", "replay", "loop", "memory", "plan"]] = "all",
     env: str = "ant-u",
     agent: str = "ris",
     batch: Count = 256,
@@ -213,7 +213,7 @@ def bench(
     num_envs: Count = 64,
     json: bool = False,
 ) -> None:
-    """Measure how fast this machine updates, simulates and stores, and what memory that takes.
+    """Measure how fast this machine updates, simulates, stores and plans, and what memory it takes.
 
     Args:
         what: One piece, or all of them.
@@ -225,6 +225,7 @@ def bench(
         json: Print one JSON object.
     """
     from midway.training import bench as measure
+    from midway.training import bench_plan
 
     pieces: dict[str, Callable[[], dict[str, Any]]] = {
         "update": lambda: measure.update(env, agent, batch, precision),
@@ -232,6 +233,7 @@ def bench(
         "replay": lambda: measure.replay(env, batch),
         "loop": lambda: measure.whole_loop(env, agent, batch, precision),
         "memory": lambda: measure.memory(env, agent, batch, precision),
+        "plan": lambda: bench_plan.plan(env, precision),
     }
     chosen = pieces if what == "all" else {what: pieces[what]}
     of = {"env": env, "agent": agent, "batch": batch, "precision": precision, "num_envs": num_envs}

@@ -1,0 +1,51 @@
+"""How long LEAP takes to plan an episode on this machine."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from midway.agents import leap
+from midway.envs import registry as environments
+from midway.presets import preset
+from midway.training.bench import Figures, medians
+
+REPETITIONS = 3
+
+
+def plan(
+    env: str, precision: str, samples: int | None = None, subgoals: int | None = None
+) -> Figures:
+    """Time one plan at the start of one episode, with the preset ``paper`` and untrained networks.
+
+    Args:
+        env: Environment.
+        precision: ``f32`` or ``bf16``.
+        samples: Candidates of an iteration, instead of the preset's.
+        subgoals: Subgoals of the plan, instead of the preset's.
+    """
+    _, config = preset(env, "leap", "paper")
+    config = replace(
+        config,
+        precision=precision,
+        plan_samples=samples or config.plan_samples,
+        num_subgoals=subgoals or config.num_subgoals,
+    )
+    spec = environments.make_vec(env).goal_spec
+    state = leap.create(config, spec, jax.random.key(0))
+    inputs = (
+        leap.codes(state, jnp.zeros((1, *spec.observation_shape), spec.observation_dtype))[0],
+        leap.codes(state, jnp.zeros((1, *spec.goal_shape), spec.observation_dtype))[0],
+        jnp.zeros((), jnp.int32),
+        jnp.zeros((config.num_subgoals, config.latent_size)),
+        jax.random.key(1),
+    )
+    search = eqx.filter_jit(leap.plan)
+    times = medians({"plan": lambda: search(state, *inputs)}, REPETITIONS)
+    return {
+        "samples": config.plan_samples,
+        "iterations": config.plan_iterations,
+        "subgoals": config.num_subgoals,
+        "plan_s": times["plan"] / 1e3,
+    }
