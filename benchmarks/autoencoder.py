@@ -2,8 +2,8 @@
 
     python benchmarks/autoencoder.py [ENV]
 
-Trains it as `midway train ENV --agent leap` does, before anything else is learned: about a minute for
-each setting. Writes ``benchmarks/results/autoencoder/ENV.csv``.
+Trains it as `midway train ENV --agent leap` does, before anything else is learned: about a minute
+for each setting. Writes ``benchmarks/results/autoencoder/ENV.csv``.
 """
 
 import argparse
