@@ -190,6 +190,7 @@ QUICK["push-state"] = replace(
 PUSH_QUICK: dict[str, Any] = {
     "policy_learning_rate": 1e-3,  # [curves] the ant's
     "encoder_learning_rate": 3e-4,
+    "encoder_updates": 15_000,  # [curves] policies improve once codes stay what they are
     "image_translation": 4,  # [curves] 8 are 5.7 cm, more than a goal may be missed by
 }
 LEAP_QUICK = {"vae_rounds": 300, "plan_samples": 1_000, "plan_iterations": 20}  # [leap.md]

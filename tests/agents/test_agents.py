@@ -52,6 +52,7 @@ def test_defaults_are_table_1_for_ant_navigation():
         "policy_learning_rate": 1e-3,
         "subgoal_learning_rate": 1e-4,
         "encoder_learning_rate": 1e-4,
+        "encoder_updates": 0,
         "image_translation": 8,
         "image_pooling": 1,
         "kl_weight": 0.1,

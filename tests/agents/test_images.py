@@ -1,5 +1,7 @@
 """Agents on images: one encoder for all networks, trained by the critics' loss alone."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -65,7 +67,7 @@ def test_the_encoder_is_trained_by_the_critics_loss_of_the_current_image_alone(n
     after, _ = eqx.filter_jit(agent.update)(state, drawn(), KEY)
     count = {"ris": 4, "sac": 3}[name]
     encoding_key, target_key = jax.random.split(KEY, count)[:2]
-    observation, batch = encoders.encode_fixed(state.encoder, drawn(), encoding_key)
+    observation, batch = encoders.encode_fixed(state.encoder, drawn(), True, encoding_key)
     target = agent.critic_target(state, batch, jax.random.normal(target_key, (BATCH, 2)))
 
     def loss(encoder):
@@ -104,3 +106,29 @@ def test_acting_sees_images_as_they_are(name):
     assert actions.shape == (BATCH, 2)
     alone = agent.act(state, images[3:4], goals[3:4], jax.random.key(5), explore=False)
     np.testing.assert_allclose(actions[3:4], alone, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["ris", "sac", "tdm"])
+def test_an_encoder_whose_updates_are_over_stays_and_the_rest_learns_on(name):
+    agent = registry.get(name)
+    state = agent.create(agent.Config(hidden=(16, 16), encoder_updates=2), SPEC, KEY)
+    update, encoders_seen, critics_seen = eqx.filter_jit(agent.update), [], []
+    for i in range(4):
+        state, _ = update(state, drawn(), jax.random.key(i))
+        encoders_seen.append(leaves((state.encoder, state.encoder_optimizer)))
+        critics_seen.append(leaves(state.critic))
+
+    def moved(first, second):
+        return any((np.asarray(a) != b).any() for a, b in zip(first, second, strict=True))
+
+    assert [moved(*pair) for pair in itertools.pairwise(encoders_seen)] == [True, False, False]
+    assert all(moved(*pair) for pair in itertools.pairwise(critics_seen))
+
+
+def test_images_are_not_translated_once_the_encoder_stays():
+    _, state = made("ris")
+    batch = drawn()
+    observation, _ = encoders.encode_fixed(state.encoder, batch, jnp.array(False), KEY)
+    np.testing.assert_array_equal(observation, batch.observation)
+    observation, _ = encoders.encode_fixed(state.encoder, batch, jnp.array(True), KEY)
+    assert (observation != batch.observation).any()

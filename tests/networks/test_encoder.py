@@ -22,6 +22,7 @@ class Config:
 
     image_translation: int = 8
     image_pooling: int = 1
+    encoder_updates: int = 0
     precision: Precision = "f32"
 
 
@@ -122,14 +123,14 @@ def batch_of_pictures():
 
 def test_fixed_codes_have_no_gradient_and_the_observation_stays_an_image(encoder):
     batch = batch_of_pictures()
-    observation, fixed = encoders.encode_fixed(encoder, batch, KEY)
+    observation, fixed = encoders.encode_fixed(encoder, batch, True, KEY)
     assert observation.shape == (4, *IMAGE)
     assert observation.dtype == jnp.uint8
     assert fixed.next_observation.shape == fixed.goal.shape == (4, CODE_SIZE)
 
     @eqx.filter_grad
     def gradient(encoder):
-        codes = encoders.encode_fixed(encoder, batch, KEY)[1]
+        codes = encoders.encode_fixed(encoder, batch, True, KEY)[1]
         return (codes.goal**2 + codes.next_observation**2).sum()
 
     assert not any(leaf.any() for leaf in jax.tree.leaves(gradient(encoder)))

@@ -34,6 +34,8 @@ class Config:
         policy_learning_rate: Adam's rate for the policy.
         subgoal_learning_rate: Adam's rate for the subgoal policy.
         encoder_learning_rate: Adam's rate for the image encoder (original code).
+        encoder_updates: Updates after which the encoder stays as it is and images are no longer
+            translated; 0 for never, as in the paper.
         image_translation: Largest random translation of an image along each axis (pixels).
         image_pooling: Side of the squares of pixels that the encoder averages first (ours).
         kl_weight: α, the weight of the KL divergence to the prior.
@@ -50,6 +52,7 @@ class Config:
     policy_learning_rate: float = 1e-3
     subgoal_learning_rate: float = 1e-4
     encoder_learning_rate: float = 1e-4
+    encoder_updates: int = 0
     image_translation: int = 8
     image_pooling: int = 1
     kl_weight: float = 0.1
@@ -217,7 +220,9 @@ def policy_loss(
 def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
     """Return the state after one gradient step of every network, and scalars to log."""
     encoding_key, target_key, subgoal_key, action_key = jax.random.split(key, 4)
-    observation, batch = encoders.encode_fixed(state.encoder, batch, encoding_key)
+    done = optimizer.updates(state.critic_optimizer)
+    learns = encoders.learns(state.encoder, state.config, done)
+    observation, batch = encoders.encode_fixed(state.encoder, batch, learns, encoding_key)
     state, code, critic_metrics = update_critic(state, observation, batch, target_key)
     batch = batch._replace(
         observation=code, subgoal_candidate=subgoal_candidates(state.encoder, batch, code)
@@ -232,22 +237,10 @@ def update_critic(
 ) -> tuple[State, Float[Array, "B S"], Metrics]:
     """Step the critics and the encoder; also return the codes of the current observations."""
     target = critic_target(state, batch, jax.random.normal(key, batch.action.shape))
-    gradient_of = eqx.filter_value_and_grad(critic_loss, has_aux=True)
-    (_, (code, metrics)), (critic_gradient, encoder_gradient) = gradient_of(
-        (state.critic, state.encoder), observation, batch, target
-    )
-    critic, critic_optimizer = optimizer.step(
-        state.critic, critic_gradient, state.critic_optimizer, state.config.critic_learning_rate
-    )
-    encoder, encoder_optimizer = optimizer.step(
-        state.encoder, encoder_gradient, state.encoder_optimizer, state.config.encoder_learning_rate
-    )
-    state = replace(
-        state,
-        critic=critic,
-        critic_optimizer=critic_optimizer,
-        encoder=encoder,
-        encoder_optimizer=encoder_optimizer,
+    done = optimizer.updates(state.critic_optimizer)
+    learns = encoders.learns(state.encoder, state.config, done)
+    state, (code, metrics) = optimizer.step_critic_and_encoder(
+        critic_loss, state, learns, observation, batch, target
     )
     return state, jax.lax.stop_gradient(code), metrics
 

@@ -42,6 +42,8 @@ class Config:
         critic_learning_rate: Adam's rate for the critics.
         policy_learning_rate: Adam's rate for the policy.
         encoder_learning_rate: Adam's rate for the image encoder.
+        encoder_updates: Updates after which the encoder stays as it is and images are no longer
+            translated; 0 for never, as in the paper.
         image_translation: Largest random translation of an image along each axis (pixels).
         image_pooling: Side of the squares of pixels that the encoder averages first (ours).
         target_noise: Standard deviation of the noise on target actions.
@@ -62,6 +64,7 @@ class Config:
     critic_learning_rate: float = 1e-3
     policy_learning_rate: float = 1e-3
     encoder_learning_rate: float = 1e-4
+    encoder_updates: int = 0
     image_translation: int = 8
     image_pooling: int = 1
     target_noise: float = 0.2
@@ -196,7 +199,9 @@ def update(state: AnyState, batch: Batch, key: Key[Array, ""]) -> tuple[AnyState
     """
     encoding_key, steps_key, noise_key = jax.random.split(key, 3)
     reward = reward_vector(state.config, batch)
-    observation, batch = encoders.encode_fixed(state.encoder, batch, encoding_key)
+    done = optimizer.updates(state.critic_optimizer)
+    learns = encoders.learns(state.encoder, state.config, done)
+    observation, batch = encoders.encode_fixed(state.encoder, batch, learns, encoding_key)
     steps_left = draw_steps_left(state.config, len(batch.action), steps_key)
     noise = jax.random.normal(noise_key, batch.action.shape)
     target = critic_target(state, batch, reward, steps_left, noise)
@@ -224,18 +229,11 @@ def update_critic(
     target: Float[Array, "B R"],
 ) -> tuple[AnyState, Float[Array, "B S"], Metrics]:
     """Step the critics and the encoder; also return the codes of the current observations."""
-    gradient_of = eqx.filter_value_and_grad(critic_loss, has_aux=True)
-    (_, (code, metrics)), (critic_gradient, encoder_gradient) = gradient_of(
-        (state.critic, state.encoder), observation, batch, steps_left, target
+    done = optimizer.updates(state.critic_optimizer)
+    learns = encoders.learns(state.encoder, state.config, done)
+    state, (code, metrics) = optimizer.step_critic_and_encoder(
+        critic_loss, state, learns, observation, batch, steps_left, target
     )
-    critic, critic_optimizer = optimizer.step(
-        state.critic, critic_gradient, state.critic_optimizer, state.config.critic_learning_rate
-    )
-    encoder, encoder_optimizer = optimizer.step(
-        state.encoder, encoder_gradient, state.encoder_optimizer, state.config.encoder_learning_rate
-    )
-    state = replace(state, critic=critic, critic_optimizer=critic_optimizer)
-    state = replace(state, encoder=encoder, encoder_optimizer=encoder_optimizer)
     return state, jax.lax.stop_gradient(code), metrics
 
 

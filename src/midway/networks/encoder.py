@@ -5,7 +5,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key, Shaped, UInt8
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped, UInt8
 
 from midway.networks.convolution import Filter, in_blocks
 from midway.networks.initialization import with_centre_tap, with_orthogonal_weight
@@ -34,6 +34,10 @@ class EncoderConfig(Protocol):
     @property
     def image_pooling(self) -> int:
         """Side of the squares of pixels that are averaged before the convolutions."""
+
+    @property
+    def encoder_updates(self) -> int:
+        """Updates after which the encoder stays as it is; 0 for never."""
 
     @property
     def precision(self) -> Precision:
@@ -160,20 +164,32 @@ def code_sizes(spec: EnvSpec) -> tuple[int, int]:
     return spec.observation_shape[0], spec.goal_shape[0]
 
 
+def learns(
+    encoder: Encoder, config: EncoderConfig, updates: Int[Array, ""]
+) -> bool | Bool[Array, ""]:
+    """Return whether the encoder still learns after so many updates; that of states never ends."""
+    if config.encoder_updates == 0 or isinstance(encoder, StateEncoder):
+        return True
+    return updates < config.encoder_updates
+
+
 def encode_fixed(
-    encoder: Encoder, batch: Batch, key: Key[Array, ""]
+    encoder: Encoder, batch: Batch, learns: bool | Bool[Array, ""], key: Key[Array, ""]
 ) -> tuple[Shaped[Array, "B ..."], Batch]:
     """Return the augmented observations, and the batch with fixed codes of what follows them.
 
-    Next observations and goals are augmented and encoded without gradient; only the current
-    observation is left to be encoded within the critics' loss.
+    Images are augmented while the encoder learns. Next observations and goals are encoded without
+    gradient; only the current observation is left to be encoded within the critics' loss.
     """
     keys = jax.random.split(key, 3)
 
+    def augmented(image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Shaped[Array, "B ..."]:
+        return jnp.where(learns, encoder.augment(image, key), image)
+
     def code(image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Float[Array, "B S"]:
-        return jax.lax.stop_gradient(encoder(encoder.augment(image, key)))
+        return jax.lax.stop_gradient(encoder(augmented(image, key)))
 
     fixed = batch._replace(
         next_observation=code(batch.next_observation, keys[1]), goal=code(batch.goal, keys[2])
     )
-    return encoder.augment(batch.observation, keys[0]), fixed
+    return augmented(batch.observation, keys[0]), fixed
