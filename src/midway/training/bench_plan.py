@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from midway.agents import leap
 from midway.envs import registry as environments
-from midway.presets import preset
+from midway.training import api
 from midway.training.bench import Figures
 
 REPETITIONS = 3
@@ -29,7 +29,7 @@ def plan(
         samples: Candidates of an iteration, instead of the preset's.
         subgoals: Subgoals of the plan, instead of the preset's.
     """
-    _, config = preset(env, "leap", "paper")
+    config = api.configure(env, "leap", "paper").hyperparameters
     config = replace(
         config,
         precision=precision,
