@@ -1,9 +1,9 @@
-"""Measure what docs/performance.md shows: about twelve minutes on an idle machine.
+"""Measure what docs/performance.md shows, and how long LEAP plans, on an idle machine.
 
     python benchmarks/performance.py [PART...]
 
-Each figure but the split of an update comes from a process of its own, mostly ``midway bench``. All
-go to ``benchmarks/results/speed/midway.json``; the tables are printed as Markdown.
+Each figure but the split of an update and the plans comes from a process of its own, mostly
+``midway bench``. All go to ``benchmarks/results/speed/midway.json``; the tables are printed as Markdown.
 """
 
 import argparse

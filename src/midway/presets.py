@@ -2,7 +2,8 @@
 
 Sources: [1] table 1, [2] table 2, [B] appendix B, [D] appendix D, [code] the original code of RIS
 where the paper is silent, [LEAP] that of LEAP, [curves] measured here with ``benchmarks/run.py``,
-[leap.md] measured here, see ``docs/algorithms/leap.md``.
+[leap.md] measured here, see ``docs/algorithms/leap.md``, [trials] single runs, see
+``benchmarks/README.md``.
 """
 
 from dataclasses import fields, replace
@@ -190,8 +191,8 @@ QUICK["push-state"] = replace(
 PUSH_QUICK: dict[str, Any] = {
     "policy_learning_rate": 1e-3,  # [curves] the ant's
     "encoder_learning_rate": 3e-4,
-    "encoder_updates": 15_000,  # [curves] policies improve once codes stay what they are
-    "image_translation": 4,  # [curves] 8 are 5.7 cm, more than a goal may be missed by
+    "encoder_updates": 15_000,  # [trials] policies improve once codes stay what they are
+    "image_translation": 4,  # [trials] 8 are 5.7 cm, more than a goal may be missed by
 }
 LEAP_QUICK = {"vae_rounds": 300, "plan_samples": 1_000, "plan_iterations": 20}  # [leap.md]
 LEAP_QUICK_POINT: dict[str, Any] = {  # [leap.md]
