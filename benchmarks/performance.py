@@ -3,7 +3,8 @@
     python benchmarks/performance.py [PART...]
 
 Each figure but the split of an update and the plans comes from a process of its own, mostly
-``midway bench``. All go to ``benchmarks/results/speed/midway.json``; the tables are printed as Markdown.
+``midway bench``. All go to ``benchmarks/results/speed/midway.json``; the tables are printed as
+Markdown.
 """
 
 import argparse
