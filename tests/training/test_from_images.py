@@ -38,8 +38,13 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 @needs_renderer
-def test_exact_resume_with_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = midway.train("push", seed=1, out=tmp_path / "whole", changes=SMALL)
+@pytest.mark.parametrize("encoder_updates", [8, 15_000], ids=["codes", "images"])
+def test_exact_resume_with_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoder_updates: int
+) -> None:
+    """Stopped after the twelfth update, where the replay holds codes or still images."""
+    changes = SMALL | {"encoder_updates": encoder_updates}
+    whole = midway.train("push", seed=1, out=tmp_path / "whole", changes=changes)
     advance = loop.Training.advance
 
     def interrupted(training: loop.Training) -> None:
@@ -49,7 +54,7 @@ def test_exact_resume_with_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     with monkeypatch.context() as patch:
         patch.setattr(loop.Training, "advance", interrupted)
-        run = midway.train("push", seed=1, out=tmp_path / "run", changes=SMALL)
+        run = midway.train("push", seed=1, out=tmp_path / "run", changes=changes)
     assert not run.finished
     assert midway.resume(run.path).finished
     for name in ("metrics.csv", "evaluation.csv"):

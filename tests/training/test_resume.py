@@ -187,7 +187,7 @@ def test_policy_loads_alone_and_acts_like_the_run(whole_run: Path, tmp_path: Pat
     config = RunFolder(whole_run).load_config()
     training = api.build(config, RunFolder(whole_run))
     checkpoints = Checkpoints(whole_run / "checkpoints")
-    training.load_state_dict(checkpoints.restore(400, training.state_dict()))
+    training.restore(checkpoints, 400)
     observation = training.collector.observation
     pair = observation["observation"], observation["desired_goal"]
     actions = policy(*pair)

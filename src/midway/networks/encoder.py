@@ -96,8 +96,12 @@ class ImageEncoder(eqx.Module):
         self.convolutions = tuple(layers)
         self.linear = with_orthogonal_weight(linear, keys[-1])
 
-    def __call__(self, image: UInt8[Array, "B H W 3"]) -> Float[Array, "B 16"]:
-        """Return the codes of images."""
+    def __call__(
+        self, image: UInt8[Array, "B H W 3"] | Float[Array, "B 16"]
+    ) -> Float[Array, "B 16"]:
+        """Return the codes of images; codes are returned as they are."""
+        if is_code(image):
+            return image
 
         def codes(image: UInt8[Array, "b H W 3"]) -> Float[Array, "b 16"]:
             x = pooled(image.astype(jnp.float32) / 255, self.pooling)
@@ -112,10 +116,10 @@ class ImageEncoder(eqx.Module):
         """Return the codes: they are not decoded here."""
         return code
 
-    def augment(
-        self, image: UInt8[Array, "B H W 3"], key: Key[Array, ""]
-    ) -> UInt8[Array, "B H W 3"]:
+    def augment(self, image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Shaped[Array, "B ..."]:
         """Return each image moved by offsets of its own, with a black rim (appendix B)."""
+        if is_code(image):
+            return image
         rim = self.translation
         framed = jnp.pad(image, ((0, 0), (rim, rim), (rim, rim), (0, 0)))
         corners = jax.random.randint(key, (len(image), 2), 0, 2 * rim + 1)
@@ -132,6 +136,11 @@ def pooled(image: Float[Array, "B H W C"], side: int) -> Float[Array, "B h w C"]
     batch, height, width, channels = image.shape
     squares = image.reshape(batch, height // side, side, width // side, side, channels)
     return squares.mean((2, 4))
+
+
+def is_code(image: Shaped[Array, "B ..."]) -> bool:
+    """Return whether these are codes already, kept because their encoder learns no more."""
+    return image.ndim == 2
 
 
 Encoder: TypeAlias = StateEncoder | ImageEncoder
@@ -165,7 +174,7 @@ def code_sizes(spec: EnvSpec) -> tuple[int, int]:
 
 
 def learns(
-    encoder: Encoder, config: EncoderConfig, updates: Int[Array, ""]
+    encoder: Encoder, config: EncoderConfig, updates: int | Int[Array, ""]
 ) -> bool | Bool[Array, ""]:
     """Return whether the encoder still learns after so many updates; that of states never ends."""
     if config.encoder_updates == 0 or isinstance(encoder, StateEncoder):

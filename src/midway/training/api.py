@@ -196,7 +196,7 @@ def _run_locked(training: loop.Training, progress: bool) -> Run:
     checkpoints = Checkpoints(folder.checkpoints)
     latest = checkpoints.latest()
     if latest is not None:
-        training.load_state_dict(checkpoints.restore(latest, training.state_dict()))
+        training.restore(checkpoints, latest)
     say: Reporter = reporter(training.config.train.steps, training.steps) if progress else Silent()
     logger = Logger(
         folder.metrics_file, folder.evaluation_file, folder.path / "events", training.steps

@@ -91,23 +91,24 @@ class Devices:
         return placed
 
 
-def compile_by_lane(function: Callable[..., Tree]) -> Callable[..., Tree]:
+def compile_by_lane(
+    function: Callable[..., Any], donated: tuple[int, ...] = (0,)
+) -> Callable[..., Any]:
     """Compile a function of a tree ``(K, ...)`` and of values ``(K, ...)`` that keeps lanes apart.
 
-    The tree is donated. Where it is split over devices, each device does its own lanes, without a
-    word to the others.
+    The tree is donated, unless told otherwise. Where it is split over devices, each device does its
+    own lanes, without a word to the others.
     """
-    on_one_device = jax.jit(function, donate_argnums=0)
+    on_one_device = jax.jit(function, donate_argnums=donated)
 
     @cache
-    def on(mesh: Mesh) -> Callable[..., Tree]:
+    def on(mesh: Mesh) -> Callable[..., Any]:
         by_device = jax.shard_map(function, mesh=mesh, in_specs=SPLIT, out_specs=SPLIT)
-        return jax.jit(by_device, donate_argnums=0)
+        return jax.jit(by_device, donate_argnums=donated)
 
-    def run(tree: Tree, *values: Any) -> Tree:
+    def run(tree: PyTree, *values: Any) -> Any:
         sharding = jax.tree.leaves(tree)[0].sharding
         compiled = on(sharding.mesh) if isinstance(sharding, NamedSharding) else on_one_device
-        new: Tree = compiled(tree, *values)
-        return new
+        return compiled(tree, *values)
 
     return run

@@ -18,7 +18,8 @@ import jax
 import numpy as np
 
 from midway.replay import buffer
-from midway.training import acting, pretrain
+from midway.replay.storage import ReplayState
+from midway.training import acting, codes, pretrain
 from midway.training import policy as policies
 from midway.training import step as steps_of
 from midway.training.arrays import named_arrays, with_named_arrays
@@ -119,7 +120,24 @@ class Training:
                 self.arrays, self.totals, self.replay, self._update_key, self.updates
             )
             self.updates += per_call
+        self._leave_images()
         self.training_seconds += time.perf_counter() - started
+
+    def _leave_images(self) -> None:
+        """Go on with codes instead of images, if the encoder has just learned its last."""
+        if codes.holds_codes(self.spec, self.replay.rows["observation"].shape):
+            return
+        encoder = codes.encoder_that_stays(self.state, self.updates)
+        if encoder is not None:
+            self._see_codes(codes.encoded(self.replay, encoder))
+
+    def _see_codes(self, replay: ReplayState) -> None:
+        """Collect codes into a replay of codes."""
+        encode = self._devices.compile(lambda encoder, images: encoder(images))
+        env = codes.CodedEnv(self.collector.env, lambda images: encode(self.state.encoder, images))
+        self.replay = replay
+        self.collector.env = env
+        self.collector.observation = env.see(self.collector.observation)
 
     def _choose(self, observation: dict[str, Any]) -> Any:
         """Return uniform random actions at first, then sampled actions of the policy."""
@@ -191,6 +209,16 @@ class Training:
             "collector": self.collector.state_dict(),
             "counters": {name: np.array(value) for name, value in counters.items()},
         }
+
+    def restore(self, checkpoints: Checkpoints, step: int) -> None:
+        """Continue from the checkpoint of a step, bit for bit.
+
+        Raises:
+            ConfigurationError: The checkpoint is damaged or belongs to another run.
+        """
+        if codes.holds_codes(self.spec, checkpoints.shape(step, "replay", "rows.observation")):
+            self._see_codes(codes.blank(self.replay))
+        self.load_state_dict(checkpoints.restore(step, self.state_dict()))
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a ``state_dict``, bit for bit."""

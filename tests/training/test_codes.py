@@ -1,0 +1,104 @@
+"""Codes in place of images: what is kept and learned once an encoder stays as it is."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import midway
+from drawing_here import needs_renderer
+from midway.training import api, codes
+from midway.training.folder import RunFolder
+from midway.training.loop import Training
+
+SMALL = {
+    "hidden": (8, 8),
+    "batch_size": 8,
+    "num_envs": 2,
+    "random_steps": 20,
+    "updates_per_step": 0.5,
+    "replay_capacity": 500,
+    "evaluate_every": 40,
+    "evaluation_episodes": 1,
+    "log_every": 10,
+    "checkpoint_every": 30,
+    "steps": 60,
+    "precision": "f32",
+    "encoder_updates": 10,
+}
+
+
+def build(folder: Path) -> Training:
+    return api.build(api.configure("push", "ris", changes=SMALL), RunFolder(folder))
+
+
+def advance(training: Training, updates: int) -> None:
+    while training.updates < updates:
+        training.advance()
+
+
+def observations(training: Training) -> Any:
+    return training.replay.rows["observation"]
+
+
+@needs_renderer
+def test_a_replay_is_encoded_with_the_encoders_last_update(tmp_path: Path) -> None:
+    training = build(tmp_path)
+    advance(training, 9)
+    images = np.asarray(observations(training))
+    assert images.dtype == np.uint8
+    before = np.asarray(training.replay.num_rows)
+    advance(training, 10)
+    found = np.asarray(observations(training))
+    assert found.shape == (*images.shape[:2], 16)
+    encode = jax.jit(lambda images: training.state.encoder(images))
+    for lane, count in enumerate(before):
+        wanted = encode(images[lane, :count])
+        np.testing.assert_allclose(found[lane, :count], wanted, rtol=1e-4, atol=1e-5)
+    assert np.abs(found[:, : before.min()]).max() > 0
+
+
+@needs_renderer
+def test_what_comes_later_is_written_as_codes(tmp_path: Path) -> None:
+    training = build(tmp_path)
+    advance(training, 20)
+    newest = np.asarray(training.replay.num_rows) - 1
+    rows = np.asarray(observations(training))[np.arange(2), newest]
+    np.testing.assert_array_equal(rows, training.collector.observation["observation"])
+
+
+@needs_renderer
+def test_a_coded_environment_is_the_environment_seen_through_the_encoder(tmp_path: Path) -> None:
+    encoder = build(tmp_path).state.encoder
+    encode = jax.jit(lambda images: encoder(images))
+    bare = midway.make_vec("push", num_envs=2)
+    coded = codes.CodedEnv(midway.make_vec("push", num_envs=2), encode)
+    pairs = [(bare.reset(seed=3)[0], coded.reset(seed=3)[0])]
+    actions = np.ones((2, 2), np.float32)
+    pairs += [(bare.step(actions)[0], coded.step(actions)[0]) for _ in range(2)]
+    mask = np.array([True, False])
+    pairs += [tuple(e.reset(options={"reset_mask": mask})[0] for e in (bare, coded))]
+    for images, seen in pairs:
+        assert set(images) == set(seen)
+        np.testing.assert_array_equal(images["achieved_state"], seen["achieved_state"])
+        for name in codes.IMAGES:
+            np.testing.assert_allclose(seen[name], encode(images[name]), rtol=1e-4, atol=1e-5)
+
+
+@needs_renderer
+def test_learning_from_codes_is_learning_from_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    coded = build(tmp_path / "codes")
+    advance(coded, 14)
+    monkeypatch.setattr(codes, "encoder_that_stays", lambda state, updates: None)
+    pictured = build(tmp_path / "images")
+    advance(pictured, 14)
+    assert observations(coded).ndim == 3
+    assert observations(pictured).ndim == 5
+    for one, other in zip(
+        jax.tree.leaves(coded.arrays), jax.tree.leaves(pictured.arrays), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)
