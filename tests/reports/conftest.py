@@ -1,4 +1,4 @@
-"""Run folders to draw: two tiny ones that are trained once, and copies of them."""
+"""Run folders to draw: two tiny ones that are trained once, copies of them, and untrained arms."""
 
 import json
 import shutil
@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from midway.training import api
+from midway.training import api, decoder, policy
+from midway.training.folder import RunFolder
 
 TINY = {
     "num_envs": 8,
@@ -21,6 +22,13 @@ TINY = {
     "log_every": 200,
     "checkpoint_every": 1_200,
 }
+
+
+UNTRAINED = {"hidden": (8,), "num_envs": 1, "replay_capacity": 300, "random_steps": 10}
+EVALUATED = (
+    "step,updates,seconds,training_seconds,task,actions,episodes,success_rate,final_distance"
+)
+EVALUATED += ",episode_length,final_distance_hand,final_distance_puck"
 
 
 def train(out: Path, agent: str) -> Path:
@@ -52,3 +60,37 @@ def copy_run(tmp_path: Path) -> Callable[..., Path]:
         return folder
 
     return copy
+
+
+def untrained(path: Path, env: str, agent: str) -> Path:
+    """Return a run folder of an agent that has learned nothing, with two evaluations."""
+    folder = RunFolder(path)
+    config = api.configure(env, agent, changes=UNTRAINED)
+    training = api.build(config, folder)
+    folder.create(config)
+    policy.save(folder, config, training.state, 200)
+    rows = [EVALUATED]
+    for step in (100, 200):
+        for task in ("hard", "uniform"):
+            rows += [
+                f"{step},0,1,1,{task},{actions},4,0.5,0.3,90,0.1,0.3"
+                for actions in ("mean", "sampled")
+            ]
+    folder.evaluation_file.write_text("\n".join(rows) + "\n")
+    return path
+
+
+@pytest.fixture(scope="session")
+def state_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return untrained(tmp_path_factory.mktemp("runs") / "state", "push-state", "ris")
+
+
+@pytest.fixture(scope="session")
+def image_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return untrained(tmp_path_factory.mktemp("runs") / "image", "push", "ris")
+
+
+@pytest.fixture
+def quick_decoder(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"IMAGES": 40, "COPIES": 5, "UPDATES": 2, "UPDATES_PER_CALL": 2}.items():
+        monkeypatch.setattr(decoder, name, value)

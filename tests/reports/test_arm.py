@@ -15,49 +15,9 @@ from midway.envs.registry import make_vec
 from midway.reports import compose, report, strips, tabletop, watch, window
 from midway.reports.rollouts import Recording
 from midway.reports.scenes import TableScene, Words
-from midway.training import api, decoder, policy
+from midway.training import api
 from midway.training.folder import RunFolder
 from midway.types import ConfigurationError
-
-CHANGES = {"hidden": (8,), "num_envs": 1, "replay_capacity": 300, "random_steps": 10}
-EVALUATED = (
-    "step,updates,seconds,training_seconds,task,actions,episodes,success_rate,final_distance"
-)
-EVALUATED += ",episode_length,final_distance_hand,final_distance_puck"
-
-
-def untrained(path, env, agent):
-    """Return a run folder of an agent that has learned nothing, with two evaluations."""
-    folder = RunFolder(path)
-    config = api.configure(env, agent, changes=CHANGES)
-    training = api.build(config, folder)
-    folder.create(config)
-    policy.save(folder, config, training.state, 200)
-    rows = [EVALUATED]
-    for step in (100, 200):
-        for task in ("hard", "uniform"):
-            rows += [
-                f"{step},0,1,1,{task},{actions},4,0.5,0.3,90,0.1,0.3"
-                for actions in ("mean", "sampled")
-            ]
-    folder.evaluation_file.write_text("\n".join(rows) + "\n")
-    return path
-
-
-@pytest.fixture(scope="module")
-def state_run(tmp_path_factory):
-    return untrained(tmp_path_factory.mktemp("runs") / "state", "push-state", "ris")
-
-
-@pytest.fixture(scope="module")
-def image_run(tmp_path_factory):
-    return untrained(tmp_path_factory.mktemp("runs") / "image", "push", "ris")
-
-
-@pytest.fixture
-def quick_decoder(monkeypatch):
-    for name, value in {"IMAGES": 40, "COPIES": 5, "UPDATES": 2, "UPDATES_PER_CALL": 2}.items():
-        monkeypatch.setattr(decoder, name, value)
 
 
 def stems(files):

@@ -3,9 +3,11 @@
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 
+from drawing_here import needs_renderer
 from midway.reports import report
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
@@ -22,12 +24,13 @@ addEventListener("load", () => {
 </script>"""
 
 
-@pytest.mark.skipif(
+needs_browser = pytest.mark.skipif(
     BROWSER is None, reason="no chromium on this machine: apt-get install chromium to run it"
 )
-@pytest.mark.parametrize("width", [1280, 500])
-def test_the_page_opens_in_a_browser(ris_run, tmp_path, width):
-    page, *_ = report([ris_run], tmp_path / "out")
+
+
+def title_after_loading(page: Path, profile: Path, width: int) -> str:
+    """Return what the page found out about itself; nothing may be written to the console."""
     page.write_text(page.read_text().replace("</body>", LOOK + "</body>"))
     command = [
         BROWSER,
@@ -36,12 +39,28 @@ def test_the_page_opens_in_a_browser(ris_run, tmp_path, width):
         "--disable-gpu",
         "--enable-logging=stderr",
     ]
-    command += ["--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'profile'}"]
+    command += ["--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={profile}"]
     command += [f"--window-size={width},900", "--virtual-time-budget=5000", "--dump-dom"]
     done = subprocess.run(
         [*command, page.as_uri()], capture_output=True, text=True, timeout=300, check=True
     )
+    assert "CONSOLE" not in done.stderr
     title = re.search("<title>(.*?)</title>", done.stdout)
     assert title is not None
-    assert title[1] == "images 6 loaded 6 fetched 0 wide 0"
-    assert "CONSOLE" not in done.stderr
+    return title[1]
+
+
+@needs_browser
+@pytest.mark.parametrize("width", [1280, 500])
+def test_the_page_opens_in_a_browser(ris_run, tmp_path, width):
+    page, *_ = report([ris_run], tmp_path / "out")
+    title = title_after_loading(page, tmp_path / "profile", width)
+    assert title == "images 6 loaded 6 fetched 0 wide 0"
+
+
+@needs_browser
+@needs_renderer
+def test_the_page_of_images_opens_in_a_browser(image_run, tmp_path, quick_decoder):
+    page, *_ = report([image_run], tmp_path / "out")
+    title = title_after_loading(page, tmp_path / "profile", 1280)
+    assert title == "images 4 loaded 4 fetched 0 wide 0"

@@ -7,16 +7,23 @@ Writes ``found.json``, and arrays by name: ``start-N.npz`` after some updates on
 import json
 import re
 import sys
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from midway.training import api
+from midway.agents import ris
+from midway.envs.push import IMAGE_SPEC
+from midway.networks import encoder as encoders
+from midway.replay import buffer
+from midway.training import api, codes, step
 from midway.training.arrays import named_arrays
 from midway.training.checkpoint import Checkpoints
 from midway.training.compilation import use_compilation_cache
+from midway.training.devices import Devices
 from midway.training.folder import RunFolder
 from midway.training.loop import Training
 
@@ -86,6 +93,27 @@ def look(training: Training) -> dict[str, Any]:
     }
 
 
+def codes_of_lanes() -> dict[str, Any]:
+    """Return how the codes of a replay of images lie, and how far they are from one device's."""
+    spec = replace(IMAGE_SPEC, observation_shape=(31, 31, 3))
+    encoder = encoders.create(spec, ris.Config(), jax.random.key(0))
+    observation = np.random.default_rng(0).integers(0, 256, (8, 31, 31, 3), np.uint8)
+    state = np.zeros((8, 4), np.float32)
+    seen = {"observation": observation, "desired_goal": observation[::-1]}
+    seen |= {"achieved_state": state, "desired_state": state}
+    found = []
+    for number in (1, NUMBER):
+        replay = Devices.first(number).allocate(partial(buffer.create, spec, 1_632, 8))
+        replay = step.begin(replay, seen, np.ones(8, np.bool_))
+        found.append(codes.encoded(replay, encoder).rows["observation"])
+    difference = float(np.abs(np.asarray(found[0]) - np.asarray(found[1])).max())
+    return {
+        "lanes_of_codes": [s.data.shape[0] for s in found[1].addressable_shards],
+        "difference_of_codes": difference,
+        "largest_code": float(np.abs(np.asarray(found[0])).max()),
+    }
+
+
 def main(folder: Path) -> None:
     use_compilation_cache()
     trainings = {number: build(folder, number) for number in (1, NUMBER)}
@@ -98,13 +126,14 @@ def main(folder: Path) -> None:
     for number, other in ((1, NUMBER), (NUMBER, 1)):
         checkpoints = Checkpoints(folder / f"checkpoints-{number}")
         resumed = build(folder, other)
-        resumed.load_state_dict(checkpoints.restore(resumed_at(checkpoints), resumed.state_dict()))
+        resumed.restore(checkpoints, resumed_at(checkpoints))
         advance(resumed, 16)
         write(folder / f"{number}-then-{other}.npz", resumed)
         checkpoints.close()
     advance(trainings[1], 16)
     write(folder / "1-then-1.npz", trainings[1])
-    (folder / "found.json").write_text(json.dumps(look(trainings[NUMBER])))
+    found = look(trainings[NUMBER]) | codes_of_lanes()
+    (folder / "found.json").write_text(json.dumps(found))
 
 
 def resumed_at(checkpoints: Checkpoints) -> int:

@@ -70,6 +70,11 @@ def test_devices_send_rows_that_are_drawn_and_never_the_replay(found: dict[str, 
     assert found["largest_sent"] < found["numbers_in_a_lane"]
 
 
+def test_each_device_encodes_the_images_of_its_lanes(found: dict[str, Any]) -> None:
+    assert found["lanes_of_codes"] == [2, 2, 2, 2]
+    assert found["difference_of_codes"] < 1e-5 < found["largest_code"]
+
+
 def test_everything_compiles_once_and_is_written_in_place(found: dict[str, Any]) -> None:
     assert found["compilations"] == {"train": 1, "act": 1}
     assert found["in_place"]
