@@ -167,15 +167,17 @@ QUICK = {
 QUICK["point-omega"] = replace(QUICK["point"], steps=48_000)  # [curves] the longest way
 QUICK["push"] = replace(
     PAPER,
-    steps=400_000,
+    steps=150_000,
     num_envs=8,
-    updates_per_step=0.25,  # steps are cheaper than updates, and each shows new images
-    batch_size=64,
+    random_steps=20_000,
+    updates_per_step=0.5,
+    batch_size=256,
+    encoder_batch_size=64,  # [trials] four times as many cost four times as much
     replay_capacity=102_000,
-    evaluate_every=20_000,
+    evaluate_every=25_000,
     evaluation_episodes=50,
     log_every=2_000,
-    checkpoint_every=20_000,
+    checkpoint_every=25_000,
     task="near",  # [code] hands that start beside the puck push it now and then
 )
 QUICK["push-state"] = replace(
@@ -183,8 +185,8 @@ QUICK["push-state"] = replace(
     steps=60_000,  # [curves]
     random_steps=5_000,
     updates_per_step=1.0,
-    batch_size=256,
     evaluate_every=10_000,
+    checkpoint_every=20_000,
 )
 """The loop by environment or family of environments; others take the point's."""
 

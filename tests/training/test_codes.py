@@ -9,9 +9,13 @@ import pytest
 
 import midway
 from drawing_here import needs_renderer
-from midway.training import api, codes
+from midway.envs.push import IMAGE_SPEC, STATE_SPEC
+from midway.replay import buffer
+from midway.training import api, codes, step
+from midway.training.config import TrainConfig
 from midway.training.folder import RunFolder
 from midway.training.loop import Training
+from midway.types import ConfigurationError
 
 SMALL = {
     "hidden": (8, 8),
@@ -25,6 +29,7 @@ SMALL = {
     "log_every": 10,
     "checkpoint_every": 30,
     "steps": 60,
+    "encoder_batch_size": 0,
     "precision": "f32",
     "encoder_updates": 10,
 }
@@ -102,3 +107,20 @@ def test_learning_from_codes_is_learning_from_images(
         jax.tree.leaves(coded.arrays), jax.tree.leaves(pictured.arrays), strict=True
     ):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(("asked", "images", "coded"), [(0, 64, 64), (16, 16, 64)])
+def test_batches_are_smaller_only_while_images_are_encoded(
+    asked: int, images: int, coded: int
+) -> None:
+    config = TrainConfig(batch_size=64, encoder_batch_size=asked)
+    replay = buffer.create(IMAGE_SPEC, 204, 1)
+    assert step.batch_size(config, replay) == images
+    assert step.batch_size(config, codes.blank(replay)) == coded
+    states = buffer.create(STATE_SPEC, 204, 1)
+    assert step.batch_size(config, states) == 64
+
+
+def test_a_batch_of_images_below_nothing_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="encoder_batch_size -1"):
+        api.configure("push", changes={"encoder_batch_size": -1})

@@ -17,6 +17,7 @@ from midway.training import loop
 SMALL = {
     "hidden": (8, 8),
     "batch_size": 8,
+    "encoder_batch_size": 4,
     "num_envs": 2,
     "random_steps": 20,
     "updates_per_step": 0.5,

@@ -268,6 +268,7 @@ def filled(
     settings = {
         "num_envs": 8,
         "batch_size": batch,
+        "encoder_batch_size": 0,
         "precision": precision,
         "updates_per_step": updates_per_call / 8,
         "random_steps": ROWS,

@@ -5,6 +5,8 @@ from fractions import Fraction
 
 from midway.types import ConfigurationError, RelabelMix
 
+MAY_BE_ZERO = ("random_steps", "encoder_batch_size")
+
 
 @dataclass(frozen=True)
 class TrainConfig:
@@ -16,6 +18,7 @@ class TrainConfig:
         random_steps: Environment steps with uniform random actions, before the first update.
         updates_per_step: Updates for each environment step after the random ones; kept exactly.
         batch_size: Transitions in the batch of one update.
+        encoder_batch_size: The same as long as updates encode images; 0 for ``batch_size``.
         replay_capacity: Rows of the replay; an episode of T steps takes T + 2.
         relabel: Shares of own, random and future goals.
         evaluate_every: Environment steps between evaluations.
@@ -31,6 +34,7 @@ class TrainConfig:
     random_steps: int = 10_000
     updates_per_step: float = 1.0
     batch_size: int = 2048
+    encoder_batch_size: int = 0
     replay_capacity: int = 1_000_000
     relabel: RelabelMix = field(default_factory=RelabelMix)
     evaluate_every: int = 10_000
@@ -47,14 +51,18 @@ class TrainConfig:
             ConfigurationError: A number is not positive, or rows cannot be divided over devices.
         """
         for name, value in vars(self).items():
-            if name not in ("relabel", "random_steps", "task") and value <= 0:
+            if name not in (*MAY_BE_ZERO, "relabel", "task") and value <= 0:
                 raise ConfigurationError(f"{name} {value}: must be positive")
+        if self.encoder_batch_size < 0:
+            raise ConfigurationError(
+                f"encoder_batch_size {self.encoder_batch_size}: must not be below 0"
+            )
         if self.random_steps < self.num_envs:
             raise ConfigurationError(
                 f"random_steps {self.random_steps}: at least one step of each of the "
                 f"{self.num_envs} environments must come before the first update"
             )
-        for name in ("num_envs", "batch_size"):
+        for name in ("num_envs", "batch_size", "encoder_batch_size"):
             if getattr(self, name) % self.devices:
                 raise ConfigurationError(
                     f"{name} {getattr(self, name)}: must be a multiple of devices {self.devices}"

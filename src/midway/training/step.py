@@ -57,10 +57,12 @@ def compile_learner(
     def train(
         arrays: Arrays, totals: Metrics, replay: ReplayState, key: Key[Array, ""], updates: Any
     ) -> tuple[Arrays, Metrics]:
+        size = batch_size(config, replay)
+
         def one(carry: tuple[Arrays, Metrics], count: Any) -> tuple[tuple[Arrays, Metrics], None]:
             arrays, totals = carry
             sample_key, update_key = jax.random.split(jax.random.fold_in(key, count))
-            batch = buffer.sample(replay, spec, config.relabel, config.batch_size, sample_key)
+            batch = buffer.sample(replay, spec, config.relabel, size, sample_key)
             # Whole first: what to draw is then computed on every device, and only rows are sent.
             batch = devices.split_inside(devices.copied_inside(batch))
             state, metrics = agent.update(eqx.combine(arrays, static), batch, update_key)
@@ -81,6 +83,12 @@ def compile_learner(
     )
 
 
+def batch_size(config: TrainConfig, replay: ReplayState) -> int:
+    """Return how many transitions an update draws: fewer, if asked, where it must encode images."""
+    has_images = replay.rows["observation"].dtype == jnp.uint8
+    return (config.encoder_batch_size if has_images else 0) or config.batch_size
+
+
 def empty_totals(
     agent: ModuleType, arrays: Arrays, static: Any, config: TrainConfig, replay: ReplayState
 ) -> Metrics:
@@ -88,7 +96,7 @@ def empty_totals(
     spec = static.spec
 
     def metrics(arrays: Arrays, replay: ReplayState, key: Key[Array, ""]) -> Metrics:
-        batch = buffer.sample(replay, spec, config.relabel, config.batch_size, key)
+        batch = buffer.sample(replay, spec, config.relabel, batch_size(config, replay), key)
         logged: Metrics = agent.update(eqx.combine(arrays, static), batch, key)[1]
         return logged
 
