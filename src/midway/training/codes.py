@@ -32,6 +32,11 @@ def encoder_that_stays(state: Any, updates: int) -> ImageEncoder | None:
     return encoder
 
 
+def holds_images(replay: ReplayState) -> bool:
+    """Return whether a replay's observations are images."""
+    return bool(replay.rows["observation"].dtype == jnp.uint8)
+
+
 def holds_codes(spec: EnvSpec, shape: tuple[int, ...]) -> bool:
     """Return whether a replay's observations, of this shape, are codes instead of images."""
     return spec.is_image and shape[2:] == (CODE_SIZE,)

@@ -125,7 +125,7 @@ class Training:
 
     def _leave_images(self) -> None:
         """Go on with codes instead of images, if the encoder has just learned its last."""
-        if codes.holds_codes(self.spec, self.replay.rows["observation"].shape):
+        if not codes.holds_images(self.replay):
             return
         encoder = codes.encoder_that_stays(self.state, self.updates)
         if encoder is not None:

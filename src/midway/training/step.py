@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from midway.replay import buffer
 from midway.replay.storage import ReplayState
-from midway.training import acting
+from midway.training import acting, codes
 from midway.training.config import TrainConfig
 from midway.training.devices import Devices, compile_by_lane
 from midway.types import EnvSpec, Memory, Metrics
@@ -85,8 +85,8 @@ def compile_learner(
 
 def batch_size(config: TrainConfig, replay: ReplayState) -> int:
     """Return how many transitions an update draws: fewer, if asked, where it must encode images."""
-    has_images = replay.rows["observation"].dtype == jnp.uint8
-    return (config.encoder_batch_size if has_images else 0) or config.batch_size
+    smaller = config.encoder_batch_size if codes.holds_images(replay) else 0
+    return smaller or config.batch_size
 
 
 def empty_totals(
