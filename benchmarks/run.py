@@ -38,7 +38,7 @@ SUITES: dict[str, list[Job]] = {
     "push-state": [Job("push-state", agent, 0) for agent in ("ris", "sac")],
     "push": [Job("push", "ris", 0)],
     "precision": [Job("point-u", "ris", seed, F32, "f32") for seed in SEEDS],
-    "ant-u": [Job("ant-u", agent, 0, BF16) for agent in ("ris", "sac")],
+    "ant-u": [Job("ant-u", agent, 0, BF16) for agent in ("ris", "sac", "leap")],
 }
 
 

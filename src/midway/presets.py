@@ -167,17 +167,16 @@ QUICK = {
 QUICK["point-omega"] = replace(QUICK["point"], steps=48_000)  # [curves] the longest way
 QUICK["push"] = replace(
     PAPER,
-    steps=150_000,
+    steps=250_000,
     num_envs=8,
-    random_steps=20_000,
-    updates_per_step=0.5,
+    updates_per_step=0.25,  # [trials] steps are cheaper than updates, and each shows new images
     batch_size=256,
-    encoder_batch_size=64,  # [trials] four times as many cost four times as much
+    encoder_batch_size=64,  # [trials] batches of images cost 40 times as much as those of codes
     replay_capacity=102_000,
-    evaluate_every=25_000,
+    evaluate_every=30_000,
     evaluation_episodes=50,
     log_every=2_000,
-    checkpoint_every=25_000,
+    checkpoint_every=30_000,
     task="near",  # [code] hands that start beside the puck push it now and then
 )
 QUICK["push-state"] = replace(

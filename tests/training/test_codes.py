@@ -12,6 +12,7 @@ from drawing_here import needs_renderer
 from midway.envs.push import IMAGE_SPEC, STATE_SPEC
 from midway.replay import buffer
 from midway.training import api, codes, step
+from midway.training.arrays import named_arrays
 from midway.training.config import TrainConfig
 from midway.training.folder import RunFolder
 from midway.training.loop import Training
@@ -48,6 +49,10 @@ def observations(training: Training) -> Any:
     return training.replay.rows["observation"]
 
 
+def leaves(training: Training) -> dict[str, Any]:
+    return {name: np.array(array) for name, array in named_arrays(training.arrays).items()}
+
+
 @needs_renderer
 def test_a_replay_is_encoded_with_the_encoders_last_update(tmp_path: Path) -> None:
     training = build(tmp_path)
@@ -63,6 +68,27 @@ def test_a_replay_is_encoded_with_the_encoders_last_update(tmp_path: Path) -> No
         wanted = encode(images[lane, :count])
         np.testing.assert_allclose(found[lane, :count], wanted, rtol=1e-4, atol=1e-5)
     assert np.abs(found[:, : before.min()]).max() > 0
+
+
+@needs_renderer
+def test_all_but_the_encoder_begins_again_on_codes(tmp_path: Path) -> None:
+    training = build(tmp_path)
+    fresh = leaves(training)
+    advance(training, 9)
+    before = leaves(training)
+    advance(training, 10)
+    again = leaves(training)
+    advance(training, 14)
+    after = leaves(training)
+    for name, array in again.items():
+        part = name.split(".")[0]
+        if part in ("encoder", "encoder_optimizer"):
+            np.testing.assert_array_equal(array, after[name], err_msg=name)
+        else:
+            np.testing.assert_array_equal(array, fresh[name], err_msg=name)
+    weights = [name for name in again if name.startswith("encoder.")]
+    assert any((again[name] != before[name]).any() for name in weights)
+    assert any((again[name] != after[name]).any() for name in again if name.startswith("policy."))
 
 
 @needs_renderer
@@ -96,6 +122,7 @@ def test_a_coded_environment_is_the_environment_seen_through_the_encoder(tmp_pat
 def test_learning_from_codes_is_learning_from_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(codes, "begun_again", lambda fresh, state: state)
     coded = build(tmp_path / "codes")
     advance(coded, 14)
     monkeypatch.setattr(codes, "encoder_that_stays", lambda state, updates: None)

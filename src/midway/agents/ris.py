@@ -221,7 +221,7 @@ def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metr
     """Return the state after one gradient step of every network, and scalars to log."""
     encoding_key, target_key, subgoal_key, action_key = jax.random.split(key, 4)
     done = optimizer.updates(state.critic_optimizer)
-    learns = encoders.learns(state.encoder, state.config, done)
+    learns = encoders.learns(state.encoder, state.config, batch.observation, done)
     observation, batch = encoders.encode_fixed(state.encoder, batch, learns, encoding_key)
     state, code, critic_metrics = update_critic(state, observation, batch, target_key)
     batch = batch._replace(
@@ -238,7 +238,7 @@ def update_critic(
     """Step the critics and the encoder; also return the codes of the current observations."""
     target = critic_target(state, batch, jax.random.normal(key, batch.action.shape))
     done = optimizer.updates(state.critic_optimizer)
-    learns = encoders.learns(state.encoder, state.config, done)
+    learns = encoders.learns(state.encoder, state.config, observation, done)
     state, (code, metrics) = optimizer.step_critic_and_encoder(
         critic_loss, state, learns, observation, batch, target
     )

@@ -200,7 +200,7 @@ def update(state: AnyState, batch: Batch, key: Key[Array, ""]) -> tuple[AnyState
     encoding_key, steps_key, noise_key = jax.random.split(key, 3)
     reward = reward_vector(state.config, batch)
     done = optimizer.updates(state.critic_optimizer)
-    learns = encoders.learns(state.encoder, state.config, done)
+    learns = encoders.learns(state.encoder, state.config, batch.observation, done)
     observation, batch = encoders.encode_fixed(state.encoder, batch, learns, encoding_key)
     steps_left = draw_steps_left(state.config, len(batch.action), steps_key)
     noise = jax.random.normal(noise_key, batch.action.shape)
@@ -230,7 +230,7 @@ def update_critic(
 ) -> tuple[AnyState, Float[Array, "B S"], Metrics]:
     """Step the critics and the encoder; also return the codes of the current observations."""
     done = optimizer.updates(state.critic_optimizer)
-    learns = encoders.learns(state.encoder, state.config, done)
+    learns = encoders.learns(state.encoder, state.config, observation, done)
     state, (code, metrics) = optimizer.step_critic_and_encoder(
         critic_loss, state, learns, observation, batch, steps_left, target
     )

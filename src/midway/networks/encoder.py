@@ -174,11 +174,19 @@ def code_sizes(spec: EnvSpec) -> tuple[int, int]:
 
 
 def learns(
-    encoder: Encoder, config: EncoderConfig, updates: int | Int[Array, ""]
+    encoder: Encoder,
+    config: EncoderConfig,
+    observation: Shaped[Array, "B ..."],
+    updates: Int[Array, ""],
 ) -> bool | Bool[Array, ""]:
-    """Return whether the encoder still learns after so many updates; that of states never ends."""
+    """Return whether the encoder learns from these observations, after so many updates.
+
+    That of states, which has nothing to learn, always does, and none learns from codes.
+    """
     if config.encoder_updates == 0 or isinstance(encoder, StateEncoder):
         return True
+    if is_code(observation):
+        return False
     return updates < config.encoder_updates
 
 

@@ -48,8 +48,8 @@ def step_critic_and_encoder(
         return lambda networks: gradient_of(networks, *inputs)
 
     networks = (agent.critic, agent.encoder)
-    if learns is True:
-        found = gradients(loss)(networks)
+    if isinstance(learns, bool):
+        found = gradients(loss if learns else without_encoder)(networks)
     else:
         found = jax.lax.cond(learns, gradients(loss), gradients(without_encoder), networks)
     (_, others), (critic_gradient, encoder_gradient) = found
@@ -57,11 +57,13 @@ def step_critic_and_encoder(
     critic, critic_optimizer = step(
         agent.critic, critic_gradient, agent.critic_optimizer, rates.critic_learning_rate
     )
+    agent = replace(agent, critic=critic, critic_optimizer=critic_optimizer)
+    if learns is False:
+        return agent, others
     before = (agent.encoder, agent.encoder_optimizer)
     after = step(*(before[0], encoder_gradient, before[1], rates.encoder_learning_rate))
     if learns is not True:
         after = jax.tree.map(lambda new, old: jnp.where(learns, new, old), after, before)
-    agent = replace(agent, critic=critic, critic_optimizer=critic_optimizer)
     return replace(agent, encoder=after[0], encoder_optimizer=after[1]), others
 
 

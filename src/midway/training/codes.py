@@ -1,10 +1,12 @@
 """Codes in place of images, once the encoder stays as it is.
 
 The replay is encoded once and each new image when it is seen; from then on updates cost what they
-cost on states, and a checkpoint holds no images.
+cost on states, and a checkpoint holds no images. All other networks begin again: they have learned
+from codes that moved, which drives the means of actions and their spread out of the tanh's reach.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from midway.networks.encoder import CODE_SIZE, ImageEncoder, learns
+from midway.networks.encoder import CODE_SIZE, ImageEncoder
 from midway.replay.storage import ReplayState
 from midway.training.devices import compile_by_lane
 from midway.types import EnvSpec
@@ -27,9 +29,9 @@ Encode = Callable[[UInt8[Any, "B H W 3"]], Float[Any, "B 16"]]
 def encoder_that_stays(state: Any, updates: int) -> ImageEncoder | None:
     """Return the agent's encoder of images if it learns no more, after so many updates."""
     encoder = getattr(state, "encoder", None)
-    if not isinstance(encoder, ImageEncoder) or learns(encoder, state.config, updates):
-        return None
-    return encoder
+    if isinstance(encoder, ImageEncoder) and 0 < state.config.encoder_updates <= updates:
+        return encoder
+    return None
 
 
 def holds_images(replay: ReplayState) -> bool:
@@ -40,6 +42,11 @@ def holds_images(replay: ReplayState) -> bool:
 def holds_codes(spec: EnvSpec, shape: tuple[int, ...]) -> bool:
     """Return whether a replay's observations, of this shape, are codes instead of images."""
     return spec.is_image and shape[2:] == (CODE_SIZE,)
+
+
+def begun_again(fresh: Any, state: Any) -> Any:
+    """Return the fresh state of the agent with the encoder that the other has learned."""
+    return replace(fresh, encoder=state.encoder, encoder_optimizer=state.encoder_optimizer)
 
 
 class CodedEnv:

@@ -67,9 +67,10 @@ class Training:
         self._make_env = make_env
         env = make_env(train.num_envs, train.task)
         self.spec = env.goal_spec
-        arrays, self._static = steps_of.split_state(
-            steps_of.create_state(agent, config.hyperparameters, self.spec, network_key)
+        self._create = partial(
+            steps_of.create_state, agent, config.hyperparameters, self.spec, network_key
         )
+        arrays, self._static = steps_of.split_state(self._create())
         self.arrays = devices.copied(arrays)
         self._fresh = self.memory = self._begin(train.num_envs)
         replay = devices.allocate(
@@ -130,6 +131,8 @@ class Training:
         encoder = codes.encoder_that_stays(self.state, self.updates)
         if encoder is not None:
             self._see_codes(codes.encoded(self.replay, encoder))
+            state = codes.begun_again(self._create(), self.state)
+            self.arrays = self._devices.copied(steps_of.split_state(state)[0])
 
     def _see_codes(self, replay: ReplayState) -> None:
         """Collect codes into a replay of codes."""
