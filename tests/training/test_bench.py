@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from drawing_here import needs_renderer
 from midway.envs.push import IMAGE_SPEC
 from midway.replay import buffer
 from midway.training import api, bench, bench_plan, step
@@ -53,6 +54,13 @@ def test_machine_says_what_figures_depend_on() -> None:
     assert found["devices"] == len(jax.devices())
     assert {"jax", "mujoco", "midway"} <= set(found["versions"])
     assert {"processor", "device", "flags", "python"} <= set(found)
+
+
+@needs_renderer
+def test_an_update_of_images_is_timed_on_their_codes_too() -> None:
+    found = bench.update("push", "sac", 4, "f32")
+    assert found["update_on_codes_ms"] > 0
+    assert found["update_ms"] > 0
 
 
 def test_noise_fills_the_replay() -> None:

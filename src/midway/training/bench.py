@@ -11,6 +11,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,8 @@ import numpy as np
 
 from midway.envs import registry as environments
 from midway.replay import buffer
-from midway.replay.storage import num_bytes
-from midway.training import api, loop, step
+from midway.replay.storage import ReplayState, num_bytes
+from midway.training import api, codes, loop, step
 from midway.training.compilation import give_back_memory
 from midway.training.folder import RunFolder
 from midway.types import EnvSpec
@@ -77,6 +78,7 @@ def medians(pieces: dict[str, Callable[[], Any]], repetitions: int = REPETITIONS
 def update(env: str, agent: str, batch: int, precision: str) -> Figures:
     """Time one update, with sampling and relabelling, and compare it with its products alone.
 
+    Where observations are images, also time one on codes of them, as after ``encoder_updates``.
     The limit is the time that the products would take at the rate of a product of 2048 x 256 by
     256 x 256 in the same precision, measured in turn with the update.
 
@@ -88,12 +90,16 @@ def update(env: str, agent: str, batch: int, precision: str) -> Figures:
     """
     training = filled(env, agent, batch, precision, updates_per_call=1)
     learner, train = training.learner, training.config.train
-    arguments = (training.replay, jax.random.key(0), 0)
-    flops = _product_flops(learner.train, (training.arrays, training.totals, *arguments))
+    arguments = (jax.random.key(0), 0)
+    inputs = (training.arrays, training.totals, training.replay, *arguments)
+    flops = _product_flops(learner.train, inputs)
+    replays = {"update_ms": training.replay}
+    if training.spec.is_image:
+        replays["update_on_codes_ms"] = codes.blank(training.replay)
 
-    def one_update() -> Any:
+    def one_update(replay: ReplayState) -> Any:
         training.arrays, training.totals = learner.train(
-            training.arrays, training.totals, *arguments
+            training.arrays, training.totals, replay, *arguments
         )
         return training.totals
 
@@ -102,7 +108,7 @@ def update(env: str, agent: str, batch: int, precision: str) -> Figures:
     )
     times = medians(
         {
-            "update_ms": one_update,
+            **{name: partial(one_update, replay) for name, replay in replays.items()},
             "sample_ms": lambda: sample(training.replay, jax.random.key(1)),
             "product": _reference_product(precision),
         }
