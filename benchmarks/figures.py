@@ -66,6 +66,9 @@ FIGURES = {
         ("push-state/*",), "push-state-distances", "benchmarks/figures/push-state-distances.png"
     ),
     "push": Source(("push/*",), "push-learning-curves", "benchmarks/figures/push.png"),
+    "push-distances": Source(
+        ("push/*",), "push-distances", "benchmarks/figures/push-distances.png"
+    ),
     "push-images": Source(
         ("push-ris-seed0",), "push-ris-images", "benchmarks/figures/push-images.png", True
     ),
