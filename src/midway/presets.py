@@ -167,7 +167,7 @@ QUICK = {
 QUICK["point-omega"] = replace(QUICK["point"], steps=48_000)  # [curves] the longest way
 QUICK["push"] = replace(
     PAPER,
-    steps=250_000,
+    steps=400_000,  # [curves]
     num_envs=8,
     updates_per_step=0.25,  # [trials] steps are cheaper than updates, and each shows new images
     batch_size=256,
