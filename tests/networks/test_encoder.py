@@ -164,5 +164,9 @@ def test_no_translation_leaves_images_as_they_are():
     encoder = encoders.create(IMAGES, replace(CONFIG, image_translation=0), KEY)
     images = pictures(3)
     np.testing.assert_array_equal(encoder.augment(images, KEY), images)
-    with pytest.raises(ConfigurationError, match="image_translation -1: must not be below 0"):
-        encoders.create(IMAGES, replace(CONFIG, image_translation=-1), KEY)
+
+
+@pytest.mark.parametrize("name", ["image_translation", "encoder_updates"])
+def test_numbers_below_zero_are_refused(name):
+    with pytest.raises(ConfigurationError, match=f"{name} -1: must not be below 0"):
+        encoders.create(IMAGES, replace(CONFIG, **{name: -1}), KEY)

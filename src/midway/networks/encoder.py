@@ -150,12 +150,13 @@ def create(spec: EnvSpec, config: EncoderConfig, key: Key[Array, ""]) -> Encoder
     """Return the encoder that suits the environment's observations.
 
     Raises:
-        ConfigurationError: A translation below 0, or squares to average that do not tile images.
+        ConfigurationError: A number below 0, or squares to average that do not tile images.
     """
     if spec.is_image:
-        translation, pooling = config.image_translation, config.image_pooling
-        if translation < 0:
-            raise ConfigurationError(f"image_translation {translation}: must not be below 0")
+        pooling = config.image_pooling
+        for name in ("image_translation", "encoder_updates"):
+            if getattr(config, name) < 0:
+                raise ConfigurationError(f"{name} {getattr(config, name)}: must not be below 0")
         sides = spec.observation_shape[:2]
         if pooling < 1 or any(s % pooling or s // pooling < SMALLEST_IMAGE for s in sides):
             raise ConfigurationError(
