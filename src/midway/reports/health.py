@@ -78,7 +78,7 @@ PANELS = (
         "Policy entropy (nats)",
         ("policy/entropy",),
         "Settles (SAC: at its target). A sudden fall: too sure too soon. RIS at 3.4 an action: "
-        "at its bound, no way back.",
+        "stuck at its bound.",
     ),
     Panel(
         "Entropy coefficient",
