@@ -1,8 +1,8 @@
 """Codes in place of images, once the encoder stays as it is.
 
-The replay is encoded once and each new image when it is seen; from then on updates cost what they
-cost on states, and a checkpoint holds no images. All other networks begin again: they have learned
-from codes that moved, which drives the means of actions and their spread out of the tanh's reach.
+The replay is encoded once and each new image when it is seen; from then on no update encodes an
+image, and a checkpoint holds none. All other networks begin again: policies that learn from codes
+that move can end with their spread at its bound, where no gradient leads back.
 """
 
 from collections.abc import Callable
