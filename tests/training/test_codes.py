@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from small import SMALL
 
 import midway
 from drawing_here import needs_renderer
@@ -18,26 +19,11 @@ from midway.training.folder import RunFolder
 from midway.training.loop import Training
 from midway.types import ConfigurationError
 
-SMALL = {
-    "hidden": (8, 8),
-    "batch_size": 8,
-    "num_envs": 2,
-    "random_steps": 20,
-    "updates_per_step": 0.5,
-    "replay_capacity": 500,
-    "evaluate_every": 40,
-    "evaluation_episodes": 1,
-    "log_every": 10,
-    "checkpoint_every": 30,
-    "steps": 60,
-    "encoder_batch_size": 0,
-    "precision": "f32",
-    "encoder_updates": 10,
-}
+CODED = SMALL | {"encoder_batch_size": 0, "precision": "f32", "encoder_updates": 10}
 
 
 def build(folder: Path) -> Training:
-    return api.build(api.configure("push", "ris", changes=SMALL), RunFolder(folder))
+    return api.build(api.configure("push", "ris", changes=CODED), RunFolder(folder))
 
 
 def advance(training: Training, updates: int) -> None:

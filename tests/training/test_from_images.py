@@ -7,6 +7,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small import SMALL
 
 import midway
 from drawing_here import needs_renderer
@@ -14,20 +15,7 @@ from midway.envs.push import IMAGE_SPEC
 from midway.replay import buffer
 from midway.training import loop
 
-SMALL = {
-    "hidden": (8, 8),
-    "batch_size": 8,
-    "encoder_batch_size": 4,
-    "num_envs": 2,
-    "random_steps": 20,
-    "updates_per_step": 0.5,
-    "replay_capacity": 500,
-    "evaluate_every": 40,
-    "evaluation_episodes": 1,
-    "log_every": 10,
-    "checkpoint_every": 30,
-    "steps": 60,
-}
+IMAGES = SMALL | {"encoder_batch_size": 4}
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -44,7 +32,7 @@ def test_exact_resume_with_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoder_updates: int
 ) -> None:
     """Stopped after the twelfth update, where the replay holds codes or still images."""
-    changes = SMALL | {"encoder_updates": encoder_updates}
+    changes = IMAGES | {"encoder_updates": encoder_updates}
     whole = midway.train("push", seed=1, out=tmp_path / "whole", changes=changes)
     advance = loop.Training.advance
 
@@ -67,7 +55,7 @@ def test_exact_resume_with_images(
 
 @needs_renderer
 def test_a_saved_policy_acts_on_images(tmp_path: Path) -> None:
-    run = midway.train("push", seed=1, out=tmp_path / "run", changes=SMALL | {"steps": 30})
+    run = midway.train("push", seed=1, out=tmp_path / "run", changes=IMAGES | {"steps": 30})
     policy = midway.load(run.path)
     observation, _ = midway.make_vec("push", num_envs=2).reset(seed=0)
     actions = policy(observation["observation"], observation["desired_goal"])
