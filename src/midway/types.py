@@ -1,10 +1,10 @@
 """Containers and contracts that every floor shares."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
-from jaxtyping import Array, Bool, Float, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Shaped
 
 Metrics: TypeAlias = dict[str, Float[Array, ""]]
 """Scalars on the device, named ``group/name``."""
@@ -74,6 +74,27 @@ class DistanceTask:
 
 
 @dataclass(frozen=True)
+class UnknownTask:
+    """Success of an environment whose rule is not stored with the policy."""
+
+    def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
+        """Raise a ConfigurationError: only the environment itself can tell."""
+        raise ConfigurationError("what counts as reached is known to the environment alone")
+
+    def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
+        """Raise a ConfigurationError, as ``distance``."""
+        return self.distance(achieved, desired), None
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(_as_tuple(part) for part in value) if isinstance(value, list | tuple) else value
+
+
+def _as_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _as_tuple(value) for name, value in values.items()}
+
+
+@dataclass(frozen=True)
 class EnvSpec:
     """What agents and replay may know of an environment.
 
@@ -90,6 +111,8 @@ class EnvSpec:
         task: The definition of success.
         origin: Middle of the states, nothing for zeros; only where goals are observations.
         unit: What networks count in: of a state, they read (state - origin) / unit.
+        image_shape: Shape of the images that a frozen encoder made these observations of; ``None``
+            where they are the environment's own.
     """
 
     name: str
@@ -103,11 +126,44 @@ class EnvSpec:
     task: GoalTask
     origin: tuple[float, ...] = ()
     unit: float = 1.0
+    image_shape: tuple[int, ...] | None = None
 
     @property
     def is_image(self) -> bool:
         """Whether observations and goals are images."""
         return len(self.observation_shape) == 3
+
+    def encoded(self, num_features: int) -> "EnvSpec":
+        """Return the specification of the features that a frozen encoder makes of the images."""
+        return replace(
+            self,
+            observation_shape=(num_features,),
+            observation_dtype="float32",
+            goal_shape=(num_features,),
+            goal_is_observation=True,
+            image_shape=self.observation_shape,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values; of the task only what `DistanceTask` holds."""
+        values = asdict(self)
+        values["task"] = asdict(self.task) if isinstance(self.task, DistanceTask) else None
+        return values
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any]) -> "EnvSpec":
+        """Return the specification of ``to_json``; a task that is not there judges nothing.
+
+        Raises:
+            ConfigurationError: A value is missing, unknown or has the wrong type.
+        """
+        try:
+            plain = {name: _as_tuple(value) for name, value in values.items()}
+            task = plain["task"]
+            plain["task"] = UnknownTask() if task is None else DistanceTask(**_as_tuples(task))
+            return EnvSpec(**plain)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ConfigurationError(f"environment not understood: {error}") from error
 
 
 class Subgoal(NamedTuple):
@@ -169,93 +225,6 @@ class RelabelMix:
             raise ConfigurationError(
                 f"relabel mix {shares}: the shares (own, random, future) must be >= 0 and add to 1"
             )
-
-
-Config = TypeVar("Config", contravariant=True)
-State = TypeVar("State")
-
-
-class Agent(Protocol[Config, State]):
-    """An algorithm as pure functions; it never sees an environment, a logger or a file."""
-
-    def create(self, config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
-        """Return networks and optimisers at their start."""
-        ...
-
-    def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        """Return the state after one gradient step of every network, and scalars to log."""
-        ...
-
-    def act(
-        self,
-        state: State,
-        observation: Shaped[Array, "B ..."],
-        goal: Shaped[Array, "B ..."],
-        key: Key[Array, ""],
-        explore: bool,
-    ) -> Float[Array, "B action_dim"]:
-        """Return actions in [-1, 1]: sampled where ``explore``, else the tanh of the mean."""
-        ...
-
-
-Memory: TypeAlias = PyTree
-"""What an agent remembers of running episodes: arrays with one row for each."""
-
-
-@runtime_checkable
-class Remembering(Protocol):
-    """What an agent adds if it remembers something from one step of an episode to the next.
-
-    Its ``act`` is then that of an episode's first step.
-    """
-
-    def begin(self, config: Any, spec: EnvSpec, num_episodes: int) -> Memory:
-        """Return what is remembered before the first step of each episode."""
-        ...
-
-    def act_on(
-        self,
-        state: Any,
-        memory: Memory,
-        observation: Shaped[Array, "B ..."],
-        goal: Shaped[Array, "B ..."],
-        key: Key[Array, ""],
-        explore: bool,
-    ) -> tuple[Float[Array, "B action_dim"], Memory]:
-        """Return actions in [-1, 1], and what to remember until the next step."""
-        ...
-
-
-@dataclass(frozen=True)
-class Pretraining:
-    """What an agent learns from states of the environment before the first update.
-
-    Attributes:
-        networks: Parts of the agent's state that this trains; they are saved and can be reused.
-        states: Number of states.
-        random_actions: Actions taken after each reset; the states before and after each are used.
-        rounds: Calls of ``pretrain``.
-        source: Run folder whose networks are taken instead, or nothing.
-    """
-
-    networks: tuple[str, ...]
-    states: int
-    random_actions: int
-    rounds: int
-    source: str = ""
-
-
-@runtime_checkable
-class Pretrained(Protocol):
-    """What an agent adds if it learns from states of the environment before the first update."""
-
-    def pretraining(self, config: Any) -> Pretraining:
-        """Return how much there is to learn."""
-        ...
-
-    def pretrain(self, state: Any, states: Subgoal, key: Key[Array, ""]) -> tuple[Any, Metrics]:
-        """Return the agent's state after one round on these states, and scalars to log."""
-        ...
 
 
 Observation: TypeAlias = Mapping[str, Any]

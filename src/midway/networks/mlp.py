@@ -1,7 +1,7 @@
-"""Multilayer perceptrons, with products in float32 or bfloat16."""
+"""Multilayer perceptrons, with matrix products in float32 or bfloat16."""
 
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import equinox as eqx
 import jax
@@ -10,12 +10,14 @@ from jaxtyping import Array, BFloat16, Float, Key
 
 Precision: TypeAlias = Literal["f32", "bf16"]
 
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+
 DTYPES = {"f32": jnp.float32, "bf16": jnp.bfloat16}
-"""What the inputs of products are rounded to."""
+"""What the inputs of matrix products are rounded to."""
 
 
 def fastest_precision() -> Precision:
-    """Return ``bf16`` where products of bfloat16 have instructions of their own, else ``f32``.
+    """Return ``bf16`` where the processor multiplies bfloat16 matrices itself, else ``f32``.
 
     On processors that is AVX512-BF16 or AMX, on other devices it is taken for granted.
     """

@@ -26,6 +26,12 @@ class Gaussian(NamedTuple):
         """Return mean + std * noise, the reparametrised pre-tanh action."""
         return self.mean + jnp.exp(self.log_std) * noise
 
+    def act(self, key: Key[Array, ""], explore: bool) -> Float[Array, "*B A"]:
+        """Return actions in [-1, 1]: sampled where ``explore``, else the tanh of the mean."""
+        if not explore:
+            return jnp.tanh(self.mean)
+        return jnp.tanh(self.sample(jax.random.normal(key, self.mean.shape)))
+
     def log_density(self, pre_tanh: Float[Array, "*#B A"]) -> Float[Array, "*#B"]:
         """Return the log-density of pre-tanh actions, broadcast against the distributions."""
         return gaussian_log_density(pre_tanh, self.mean, self.log_std)

@@ -38,8 +38,8 @@ class Collector:
 
     Attributes:
         env: A vector environment without autoreset.
-        observation: The newest observations of all copies.
-        begun: Copies in which the last step was followed by a new episode.
+        observation: The newest observations.
+        begun: Environments in which the last step was followed by a new episode.
         counts: Episodes that ended since the last row of metrics.
         logged: Sum and number over the steps since then of each info that the environment wants
             logged, by its name in ``metrics.csv``.
@@ -57,13 +57,13 @@ class Collector:
 
     @staticmethod
     def start(env: Any, replay: ReplayState, seed: int) -> tuple["Collector", ReplayState]:
-        """Reset every copy and begin its first episode in the replay."""
+        """Reset every environment and begin its first episode in the replay."""
         observation, _ = env.reset(seed=seed)
         everyone = np.ones(env.num_envs, np.bool_)
         return Collector(env, observation, everyone), step.begin(replay, observation, everyone)
 
     def step(self, replay: ReplayState, choose: Actions) -> ReplayState:
-        """Take one step in every copy; begin new episodes where one has ended."""
+        """Take one step in every environment; begin new episodes where one has ended."""
         actions = choose(self.observation)
         self.observation, _, terminated, truncated, info = self.env.step(actions)
         for name, column in self.env.logged_info.items():
@@ -106,7 +106,7 @@ class Collector:
     ) -> tuple["Collector", ReplayState]:
         """Return the collector that ``state_dict`` was taken from, on a new environment.
 
-        Where the environment cannot continue its episodes, new ones begin in every copy.
+        Where the environment cannot continue its episodes, new ones begin in all of them.
 
         Raises:
             ConfigurationError: The state is not one of this environment.
