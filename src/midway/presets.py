@@ -76,6 +76,7 @@ class Resolved(NamedTuple):
 
 
 HINDSIGHT_OF_LEAP = RelabelMix(own=0.4, random=0.2, future=0.4)
+DISCOUNTED_FUTURE = RelabelMix(own=0.0, random=0.0, future=1.0, future_discount=0.99)
 
 PAPER: tuple[Rule, ...] = (
     Rule(
@@ -150,6 +151,7 @@ PAPER: tuple[Rule, ...] = (
         agent="leap",
         deviates="point mazes are not in the paper",
     ),
+    Rule("*", {"relabel": DISCOUNTED_FUTURE}, "CRL", agent="crl"),
 )
 """What the paper says of other tasks than ant navigation; ``quick`` begins with it."""
 

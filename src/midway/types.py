@@ -208,22 +208,30 @@ class RelabelMix:
         own: Goal that the episode was collected with.
         random: Achieved goal of a random state of the replay.
         future: Achieved goal of a later state of the same episode.
+        future_discount: A state k steps later is drawn in proportion to this to the power k; 1
+            draws uniformly from the rest of the episode, as hindsight relabelling does.
     """
 
     own: float = 0.2
     random: float = 0.4
     future: float = 0.4
+    future_discount: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the shares.
 
         Raises:
-            ConfigurationError: A share is negative or their sum is not 1.
+            ConfigurationError: A share is negative, their sum is not 1, or the discount is not in
+                (0, 1].
         """
         shares = (self.own, self.random, self.future)
         if min(shares) < 0 or abs(sum(shares) - 1) > 1e-6:
             raise ConfigurationError(
                 f"relabel mix {shares}: the shares (own, random, future) must be >= 0 and add to 1"
+            )
+        if not 0 < self.future_discount <= 1:
+            raise ConfigurationError(
+                f"relabel mix, future_discount {self.future_discount}: must be above 0, at most 1"
             )
 
 

@@ -3,7 +3,7 @@
 import importlib
 
 from midway.agent import Agent, AnyAgent
-from midway.agents import leap, ris, sac, tdm
+from midway.agents import crl, leap, ris, sac, tdm
 from midway.types import ConfigurationError
 
 AGENTS: dict[str, AnyAgent] = {
@@ -11,6 +11,7 @@ AGENTS: dict[str, AnyAgent] = {
     "sac": sac.AGENT,
     "tdm": tdm.AGENT,
     "leap": leap.AGENT,
+    "crl": crl.AGENT,
 }
 """Every agent of this package."""
 

@@ -20,7 +20,7 @@ from midway.networks import optimizer
 from midway.networks.critics import TwinCritic
 from midway.networks.encoder import Encoder
 from midway.networks.mlp import PRECISIONS, Precision
-from midway.networks.policies import Gaussian, GaussianPolicy
+from midway.networks.policies import GaussianPolicy
 from midway.settings import check, setting
 from midway.types import Batch, EnvSpec, Metrics
 
@@ -64,18 +64,9 @@ class State(eqx.Module):
 # --- losses ---------------------------------------------------------------------------------------
 
 
-def sample(
-    actions: Gaussian, noise: Float[Array, "B A"]
-) -> tuple[Float[Array, "B A"], Float[Array, " B"]]:
-    """Return tanh-squashed actions and their log-densities log π_θ(a | s, g)."""
-    pre_tanh = actions.sample(noise)
-    log_density = actions.log_density(pre_tanh) - functional.tanh_log_determinant(pre_tanh)
-    return jnp.tanh(pre_tanh), log_density
-
-
 def critic_target(state: State, batch: Batch, noise: Float[Array, "B A"]) -> Float[Array, " B"]:
     """Return r + γ (1 - terminated) (min Q'(s', a', g) - c log π(a' | s', g)), a' ~ π_θ."""
-    next_action, log_density = sample(state.policy(batch.next_observation, batch.goal), noise)
+    next_action, log_density = state.policy(batch.next_observation, batch.goal).squashed(noise)
     next_q = state.target_critic(batch.next_observation, next_action, batch.goal).min(0)
     next_value = next_q - jnp.exp(state.log_entropy_coefficient) * log_density
     terminated = batch.terminated.astype(jnp.float32)
@@ -101,7 +92,7 @@ def policy_loss(
     policy: GaussianPolicy, state: State, batch: Batch, noise: Float[Array, "B A"]
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Metrics]]:
     """Return the mean of c log π_θ(a | s, g) - min Q, and the entropy estimate."""
-    action, log_density = sample(policy(batch.observation, batch.goal), noise)
+    action, log_density = policy(batch.observation, batch.goal).squashed(noise)
     q = state.critic(batch.observation, action, batch.goal).min(0)
     loss = (jnp.exp(state.log_entropy_coefficient) * log_density - q).mean()
     entropy = -log_density.mean()

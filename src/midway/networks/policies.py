@@ -12,6 +12,7 @@ from midway.functional import (
     LOG_SCALE_MIN,
     gaussian_log_density,
     laplace_log_density,
+    tanh_log_determinant,
 )
 from midway.networks.mlp import MLP, Precision
 
@@ -31,6 +32,14 @@ class Gaussian(NamedTuple):
         if not explore:
             return jnp.tanh(self.mean)
         return jnp.tanh(self.sample(jax.random.normal(key, self.mean.shape)))
+
+    def squashed(
+        self, noise: Float[Array, "*B A"]
+    ) -> tuple[Float[Array, "*B A"], Float[Array, "*B"]]:
+        """Return tanh-squashed actions and their log-densities log π_θ(a | s, g)."""
+        pre_tanh = self.sample(noise)
+        log_density = self.log_density(pre_tanh) - tanh_log_determinant(pre_tanh)
+        return jnp.tanh(pre_tanh), log_density
 
     def log_density(self, pre_tanh: Float[Array, "*#B A"]) -> Float[Array, "*#B"]:
         """Return the log-density of pre-tanh actions, broadcast against the distributions."""

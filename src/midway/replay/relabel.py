@@ -84,11 +84,25 @@ def goal_rows(
     """Return lane and position of the row that holds the goal of each drawn transition.
 
     The batch is split into one block for each source; transitions are independent draws, so this
-    favours none. Random goals are the drawn ``states``. Future goals are uniform over the later
-    states of the episode, the transition's own next state included.
+    favours none. Random goals are the drawn ``states``. Future goals are later states of the
+    episode, the transition's own next state included.
     """
-    own, random, num_future = source_counts(mix, pairs.lane.shape[0])
+    own, random, _ = source_counts(mix, pairs.lane.shape[0])
     future = jax.tree.map(lambda leaf: leaf[own + random :], pairs)
-    steps = 1 + below(jax.random.bits(key, (num_future,)), future.last - future.position)
+    steps = steps_ahead(future.last - future.position, mix.future_discount, key)
     lane = jnp.concatenate([pairs.lane[:own], states.lane, future.lane])
     return lane, jnp.concatenate([pairs.first[:own], states.position, future.position + steps])
+
+
+def steps_ahead(left: Int[Array, " B"], discount: float, key: Key[Array, ""]) -> Int[Array, " B"]:
+    """Return how far ahead the future goals lie, from 1 to the steps that are left.
+
+    Uniform for a discount of 1, else P(k) ∝ discount^k: the discounted distribution over future
+    states, cut off where the episode ends.
+    """
+    if discount == 1:
+        return 1 + below(jax.random.bits(key, left.shape), left)
+    uniform = jax.random.uniform(key, left.shape)
+    kept = 1 - discount ** left.astype(jnp.float32)
+    ahead = jnp.floor(jnp.log1p(-uniform * kept) / jnp.log(discount)).astype(jnp.int32)
+    return 1 + jnp.clip(ahead, 0, jnp.maximum(left, 1) - 1)
