@@ -18,7 +18,7 @@ from midway.types import ConfigurationError
 
 pytestmark = [
     pytest.mark.extra,
-    pytest.mark.timeout(900),
+    pytest.mark.timeout(1800),
     # Ray leaves sockets and files of its own processes to the garbage collector.
     pytest.mark.filterwarnings("ignore"),
 ]
