@@ -155,7 +155,7 @@ def frames(screen, seen):
     """Yield a picture that is red above and blue below, until it is seen on the screen."""
     picture = np.zeros((150, 201, 3), np.uint8)
     picture[:75, :, 0] = picture[75:, :, 2] = 255
-    for _ in range(100):
+    while True:
         yield picture
         pixels = np.frombuffer(screen.read_bytes()[-400 * 300 * 4 :], np.uint8)
         seen.append(pixels.reshape(300, 400, 4)[..., 2::-1])

@@ -41,9 +41,7 @@ def title_after_loading(page: Path, profile: Path, width: int) -> str:
     ]
     command += ["--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={profile}"]
     command += [f"--window-size={width},900", "--virtual-time-budget=5000", "--dump-dom"]
-    done = subprocess.run(
-        [*command, page.as_uri()], capture_output=True, text=True, timeout=300, check=True
-    )
+    done = subprocess.run([*command, page.as_uri()], capture_output=True, text=True, check=True)
     assert "CONSOLE" not in done.stderr
     title = re.search("<title>(.*?)</title>", done.stdout)
     assert title is not None

@@ -5,6 +5,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from drawing_here import needs_renderer
 from midway.envs.push import IMAGE_SPEC
@@ -57,7 +58,9 @@ def test_machine_says_what_figures_depend_on() -> None:
 
 
 @needs_renderer
-def test_an_update_of_images_is_timed_on_their_codes_too() -> None:
+def test_an_update_of_images_is_timed_on_their_codes_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "ROWS", 2_000)
+    monkeypatch.setattr(bench, "IMAGE_ROWS", 400)
     found = bench.update("push", "sac", 4, "f32")
     assert found["update_on_codes_ms"] > 0
     assert found["update_ms"] > 0
