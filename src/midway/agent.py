@@ -10,7 +10,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from jaxtyping import Array, Float, Key, PyTree, Shaped
 
-from midway.types import Batch, EnvSpec, Metrics, Subgoal
+from midway.types import Batch, EnvSpec, Metrics, Sampling, Subgoal
 
 
 class AgentState(Protocol):
@@ -144,6 +144,7 @@ class Agent(Generic[ConfigT, StateT]):
         subgoals: ``(state, observation, goal) -> SubgoalDistribution``, if it imagines subgoals.
         memory: What it remembers of an episode, if anything.
         pretrain: What it learns before the first update, if anything.
+        sampling: ``config -> Sampling``: what it wants of a batch; None for plain transitions.
         freezing: How its image encoder is frozen; None if it reads no images.
     """
 
@@ -156,6 +157,7 @@ class Agent(Generic[ConfigT, StateT]):
     subgoals: Callable[[StateT, Inputs, Inputs], SubgoalDistribution] | None = None
     memory: EpisodeMemory[ConfigT, StateT] | None = None
     pretrain: Pretrain[ConfigT, StateT] | None = None
+    sampling: Callable[[ConfigT], Sampling] | None = None
     freezing: Freezing[StateT] | None = None
 
 

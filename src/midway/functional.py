@@ -20,7 +20,7 @@ def td_target(
     reward: Float[Array, " B"],
     terminated: Float[Array, " B"],
     next_value: Float[Array, " B"],
-    discount: float,
+    discount: float | Float[Array, " B"],
 ) -> Float[Array, " B"]:
     """Return the target of Q, r + γ (1 - terminated) V(s', g), shape ``(B,)``."""
     return reward + discount * (1 - terminated) * next_value

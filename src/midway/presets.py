@@ -189,6 +189,48 @@ QUICK: tuple[Rule, ...] = (
     Rule(
         "quick",
         {
+            "num_envs": 16,
+            "updates_per_step": 0.5,
+            "collect_limit": 300,
+            "evaluate_every": 16_000,
+            "checkpoint_every": 48_000,
+        },
+        "trials of ant-u: steps are cheaper than updates",
+        env="ant-*",
+        agent="ris sac",
+    ),
+    Rule(
+        "quick",
+        {
+            "n_step": 5,
+            "clip_targets": True,
+            "hindsight_bound": True,
+            "unreached_goals": True,
+            "num_critics": 1,
+            "layer_norm": True,
+            "normalise": True,
+            "goal_inputs": "relative",
+            "policy_every": 2,
+        },
+        "trials of ant-u: beyond the paper",
+        env="ant-*",
+        agent="ris sac",
+    ),
+    Rule(
+        "quick",
+        {
+            "num_subgoals": 4,
+            "subgoal_every": 4,
+            "candidates_per_pair": 8,
+            "advantage_temperature": 2.0,
+        },
+        "trials of ant-u: beyond the paper",
+        env="ant-*",
+        agent="ris",
+    ),
+    Rule(
+        "quick",
+        {
             "num_envs": 8,
             "random_steps": 10_000,
             "updates_per_step": 0.25,

@@ -111,6 +111,8 @@ class EnvSpec:
         task: The definition of success.
         origin: Middle of the states, nothing for zeros; only where goals are observations.
         unit: What networks count in: of a state, they read (state - origin) / unit.
+        center: Typical middle of each entry of an observation; nothing where it is not known.
+        spread: Typical deviation of each entry from it.
         image_shape: Shape of the images that a frozen encoder made these observations of; ``None``
             where they are the environment's own.
     """
@@ -126,6 +128,8 @@ class EnvSpec:
     task: GoalTask
     origin: tuple[float, ...] = ()
     unit: float = 1.0
+    center: tuple[float, ...] = ()
+    spread: tuple[float, ...] = ()
     image_shape: tuple[int, ...] | None = None
 
     @property
@@ -187,7 +191,9 @@ class Batch(NamedTuple):
     """Relabelled transitions; reward and terminated belong to ``goal``.
 
     ``outcome`` is what they were computed from; ``None`` where that is ``next_observation`` and
-    ``goal``.
+    ``goal``. The others are there where `Sampling` asks for them: ``steps`` from the observation to
+    the next one, steps that the episode needed from the observation to the goal (infinite where
+    it is not known to get there), and an observation between the two.
     """
 
     observation: Shaped[Array, "B ..."]
@@ -198,6 +204,27 @@ class Batch(NamedTuple):
     goal: Shaped[Array, "B ..."]
     subgoal_candidate: Subgoal
     outcome: Outcome | None = None
+    steps: Float[Array, " B"] | None = None
+    reached_in: Float[Array, " B"] | None = None
+    between: Shaped[Array, "B ..."] | None = None
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """What an agent wants of a batch besides transitions with relabelled goals.
+
+    Attributes:
+        n_step: Steps from an observation to its next observation, at most; the way ends earlier
+            where the goal is reached or the episode ends.
+        unreached: Whether goals that are reached in the observation itself are drawn again.
+        reached_in: Whether `Batch.reached_in` is wanted.
+        between: Whether `Batch.between` is wanted.
+    """
+
+    n_step: int = 1
+    unreached: bool = False
+    reached_in: bool = False
+    between: bool = False
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,7 @@ class Config:
     entropy_learning_rate: float = setting(3e-4, "JaxGCRL", "Adam, log c", above=0, most=1)
     encoder_learning_rate: float = setting(1e-4, "code of RIS", "Adam, images", above=0, most=1)
     random_shift: int = setting(8, "appendix B", "of images, at most (pixels)", least=0)
+    normalise: bool = setting(False, "none", "states by the environment's center and spread")
     image_pooling: int = setting(1, "not in the papers", "side of averaged squares", least=1)
     precision: Precision = setting("f32", "JaxGCRL", "of products", choices=PRECISIONS)
 

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float, Key, Shaped
 
 from midway import functional
 from midway.agent import Agent, Freezing, SubgoalDistribution, Value
+from midway.agents import beyond
 from midway.networks import encoder as encoders
-from midway.networks import optimizer
+from midway.networks import inputs, optimizer
 from midway.networks.critics import TwinCritic
 from midway.networks.encoder import Encoder, StateEncoder
 from midway.networks.mlp import PRECISIONS, Precision
@@ -25,7 +26,7 @@ from midway.types import Batch, EnvSpec, Metrics, Subgoal
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(beyond.SubgoalSettings):
     """Hyperparameters of RIS; the defaults are table 1, ant navigation."""
 
     hidden: tuple[int, ...] = setting((256, 256), "table 1", "layers of every network", least=1)
@@ -68,6 +69,13 @@ class State(eqx.Module):
 # --- losses -------------------------------------------------------------------------------------
 
 
+def as_subgoal(
+    state: State, observation: Float[Array, "*#B S"], predicted: Float[Array, "*B P"]
+) -> Subgoal:
+    """Return the subgoals that the subgoal policy's numbers stand for, in both of their roles."""
+    return encoders.as_subgoal(state.spec, state.policy.inputs.embed(observation, predicted))
+
+
 def subgoal_candidates(encoder: Encoder, batch: Batch, features: Float[Array, "B S"]) -> Subgoal:
     """Return the features of the states drawn from replay as candidates (eq. 17).
 
@@ -84,8 +92,7 @@ def critic_target(state: State, batch: Batch, noise: Float[Array, "B A"]) -> Flo
     """Return r + γ (1 - terminated) min Q'(s', a', g), a' ~ π_θ; there is no entropy term."""
     next_action = jnp.tanh(state.policy(batch.next_observation, batch.goal).sample(noise))
     next_q = state.target_critic(batch.next_observation, next_action, batch.goal)
-    terminated = batch.terminated.astype(jnp.float32)
-    return functional.td_target(batch.reward, terminated, next_q.min(0), state.config.discount)
+    return beyond.n_step_target(batch, next_q.min(0), state.config)
 
 
 def critic_loss(
@@ -114,29 +121,40 @@ def value(
     return state.critic(observation, action, goal).min(0)
 
 
+def subgoal_cost(state: State, batch: Batch, subgoal: Subgoal) -> Float[Array, " B"]:
+    """Return max(|V(s, s_g)|, |V(s_g, g)|) of one subgoal for each pair."""
+    return functional.subgoal_cost(
+        value(state, batch.observation, subgoal.achieved_goal),
+        value(state, subgoal.observation, batch.goal),
+        functional.value_bound(state.config.discount),
+    )
+
+
 def subgoal_advantage(
     state: State, batch: Batch, mean_subgoal: Float[Array, "B S"]
 ) -> Float[Array, " B"]:
     """Return the cost of the current mean subgoal minus the cost of the candidate."""
-
-    def cost(subgoal: Subgoal) -> Float[Array, " B"]:
-        return functional.subgoal_cost(
-            value(state, batch.observation, subgoal.achieved_goal),
-            value(state, subgoal.observation, batch.goal),
-            functional.value_bound(state.config.discount),
-        )
-
-    return cost(encoders.as_subgoal(state.spec, mean_subgoal)) - cost(batch.subgoal_candidate)
+    mean = as_subgoal(state, batch.observation, mean_subgoal)
+    return subgoal_cost(state, batch, mean) - subgoal_cost(state, batch, batch.subgoal_candidate)
 
 
 def subgoal_loss(
     subgoal_policy: SubgoalPolicy, state: State, batch: Batch
 ) -> tuple[Float[Array, ""], Metrics]:
     """Return the weighted negative log-likelihood of the candidates (eq. 17)."""
+    if state.config.candidates_per_pair > 1:
+        return beyond.candidate_loss(
+            subgoal_policy,
+            lambda rows, x: subgoal_cost(state, rows, encoders.as_subgoal(state.spec, x)),
+            batch,
+            state.config,
+            state.config.advantage_temperature,
+        )
     subgoals = subgoal_policy(batch.observation, batch.goal)
     advantage = jax.lax.stop_gradient(subgoal_advantage(state, batch, subgoals.location))
     weight = functional.advantage_weights(advantage, state.config.advantage_temperature)
     candidate = encoders.as_vector(state.spec, batch.subgoal_candidate)
+    candidate = subgoal_policy.inputs.pick(candidate)
     loss = functional.subgoal_loss(subgoals.log_density(candidate), weight)
     return loss, {
         "subgoal/loss": loss,
@@ -180,13 +198,21 @@ def policy_loss(
 def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
     """Return the state after one gradient step of every network, and scalars to log."""
     encoding_key, target_key, subgoal_key, action_key = jax.random.split(key, 4)
+    config, done = state.config, optimizer.updates(state.critic_optimizer)
     observation, batch = encoders.encode_batch(state.encoder, batch, encoding_key)
     state, features, critic_metrics = update_critic(state, observation, batch, target_key)
     batch = batch._replace(
-        observation=features, subgoal_candidate=subgoal_candidates(state.encoder, batch, features)
+        observation=features,
+        subgoal_candidate=subgoal_candidates(state.encoder, batch, features),
+        between=None if batch.between is None else state.encoder(batch.between),
     )
-    state, subgoal_metrics = update_subgoal_policy(state, batch)
-    state, policy_metrics = update_policy(state, batch, subgoal_key, action_key)
+    state, subgoal_metrics = beyond.every(
+        config.subgoal_every, done, lambda state: update_subgoal_policy(state, batch), state
+    )
+    keys = subgoal_key, action_key
+    state, policy_metrics = beyond.every(
+        config.policy_every, done, lambda state: update_policy(state, batch, *keys), state
+    )
     return update_targets(state), critic_metrics | subgoal_metrics | policy_metrics
 
 
@@ -224,7 +250,7 @@ def imagine(state: State, batch: Batch, key: Key[Array, ""]) -> Subgoal:
     """Return I subgoals s_g^i ~ π^H_ψ(· | s, g) for each pair, ``(B, I, S)``, without gradient."""
     subgoals = state.subgoal_policy(batch.observation, batch.goal)
     drawn = jax.lax.stop_gradient(subgoals.sample(key, state.config.num_subgoals))
-    return encoders.as_subgoal(state.spec, drawn)
+    return as_subgoal(state, batch.observation[:, None], drawn)
 
 
 def update_targets(state: State) -> State:
@@ -255,20 +281,34 @@ def subgoal_distribution(
     state: State, observation: Shaped[Array, "B ..."], goal: Shaped[Array, "B ..."]
 ) -> SubgoalDistribution:
     """Return π^H_ψ(· | s, g) in the environment's units, one Laplace for each pair."""
-    subgoals = state.subgoal_policy(state.encoder(observation), state.encoder(goal))
-    location = state.encoder.states(subgoals.location)
-    scale = state.spec.unit * jnp.exp(subgoals.log_scale)
-    return SubgoalDistribution(*(encoders.as_subgoal(state.spec, x) for x in (location, scale)))
+    features = state.encoder(observation)
+    subgoals = state.subgoal_policy(features, state.encoder(goal))
+    location = as_subgoal(state, features, subgoals.location)
+    scale = state.subgoal_policy.inputs.spread(features, jnp.exp(subgoals.log_scale))
+    return SubgoalDistribution(
+        Subgoal(*map(state.encoder.states, location)),
+        Subgoal(*map(state.encoder.spread, encoders.as_subgoal(state.spec, scale))),
+    )
 
 
 def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     """Return networks at their random start; the target networks equal the online ones."""
     encoder_key, critic_key, subgoal_key, policy_key = jax.random.split(key, 4)
-    pair, layers = sum(encoders.feature_sizes(spec)), (config.hidden, config.precision)
     encoder = encoders.create(spec, config, encoder_key)
-    critic = TwinCritic(pair + spec.action_dim, *layers, key=critic_key)
-    subgoal_policy = SubgoalPolicy(pair, encoders.subgoal_size(spec), *layers, key=subgoal_key)
-    policy = GaussianPolicy(pair, spec.action_dim, *layers, key=policy_key)
+    read = inputs.create(spec, config.goal_inputs, encoders.scale(encoder))
+    observation_size, goal_size = encoders.feature_sizes(spec)
+    pair, layers = observation_size + read.size(goal_size), (config.hidden, config.precision)
+    critic = TwinCritic(
+        pair + spec.action_dim,
+        *layers,
+        key=critic_key,
+        inputs=read,
+        layer_norm=config.layer_norm,
+        count=config.num_critics,
+    )
+    subgoal_size = len(read.coordinates) or encoders.subgoal_size(spec)
+    subgoal_policy = SubgoalPolicy(pair, subgoal_size, *layers, key=subgoal_key, inputs=read)
+    policy = GaussianPolicy(pair, spec.action_dim, *layers, key=policy_key, inputs=read)
     return State(
         encoder=encoder,
         critic=critic,
@@ -293,5 +333,6 @@ AGENT = Agent(
     networks=("encoder", "critic", "target_critic", "subgoal_policy", "policy", "prior_policy"),
     value=Value(encoders.on_observations(value), "value: minus discounted steps to the goal"),
     subgoals=subgoal_distribution,
+    sampling=lambda config: beyond.sampling(config, in_between=config.candidates_per_pair > 1),
     freezing=Freezing(lambda state: state.encoder),
 )

@@ -15,8 +15,9 @@ from jaxtyping import Array, Float, Key, Shaped
 
 from midway import functional
 from midway.agent import Agent, Freezing, Value
+from midway.agents import beyond
 from midway.networks import encoder as encoders
-from midway.networks import optimizer
+from midway.networks import inputs, optimizer
 from midway.networks.critics import TwinCritic
 from midway.networks.encoder import Encoder
 from midway.networks.mlp import PRECISIONS, Precision
@@ -26,7 +27,7 @@ from midway.types import Batch, EnvSpec, Metrics
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(beyond.Settings):
     """Hyperparameters of SAC; the defaults are table 1, ant navigation."""
 
     hidden: tuple[int, ...] = setting((256, 256), "table 1", "layers of every network", least=1)
@@ -69,8 +70,7 @@ def critic_target(state: State, batch: Batch, noise: Float[Array, "B A"]) -> Flo
     next_action, log_density = state.policy(batch.next_observation, batch.goal).squashed(noise)
     next_q = state.target_critic(batch.next_observation, next_action, batch.goal).min(0)
     next_value = next_q - jnp.exp(state.log_entropy_coefficient) * log_density
-    terminated = batch.terminated.astype(jnp.float32)
-    return functional.td_target(batch.reward, terminated, next_value, state.config.discount)
+    return beyond.n_step_target(batch, next_value, state.config)
 
 
 def critic_loss(
@@ -120,9 +120,13 @@ def value(
 def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
     """Return the state after one gradient step of every network, and scalars to log."""
     encoding_key, target_key, action_key = jax.random.split(key, 3)
+    done = optimizer.updates(state.critic_optimizer)
     observation, batch = encoders.encode_batch(state.encoder, batch, encoding_key)
     state, features, critic_metrics = update_critic(state, observation, batch, target_key)
-    state, policy_metrics = update_policy(state, batch._replace(observation=features), action_key)
+    batch = batch._replace(observation=features)
+    state, policy_metrics = beyond.every(
+        state.config.policy_every, done, lambda s: update_policy(s, batch, action_key), state
+    )
     target_critic = functional.target_update(
         state.critic, state.target_critic, state.config.target_update_rate
     )
@@ -183,10 +187,19 @@ def act(
 def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     """Return networks at their random start; the target critics equal the critics."""
     encoder_key, critic_key, policy_key = jax.random.split(key, 3)
-    pair = sum(encoders.feature_sizes(spec))
     encoder = encoders.create(spec, config, encoder_key)
-    critic = TwinCritic(pair + spec.action_dim, config.hidden, config.precision, key=critic_key)
-    policy = GaussianPolicy(pair, spec.action_dim, config.hidden, config.precision, key=policy_key)
+    read = inputs.create(spec, config.goal_inputs, encoders.scale(encoder))
+    observation_size, goal_size = encoders.feature_sizes(spec)
+    pair, layers = observation_size + read.size(goal_size), (config.hidden, config.precision)
+    critic = TwinCritic(
+        pair + spec.action_dim,
+        *layers,
+        key=critic_key,
+        inputs=read,
+        layer_norm=config.layer_norm,
+        count=config.num_critics,
+    )
+    policy = GaussianPolicy(pair, spec.action_dim, *layers, key=policy_key, inputs=read)
     log_entropy_coefficient = jnp.zeros(())
     return State(
         encoder=encoder,
@@ -210,5 +223,6 @@ AGENT = Agent(
     act,
     networks=("encoder", "critic", "target_critic", "policy"),
     value=Value(encoders.on_observations(value), "value: minus discounted steps to the goal"),
+    sampling=beyond.sampling,
     freezing=Freezing(lambda state: state.encoder),
 )

@@ -43,6 +43,7 @@ class Config:
     policy_learning_rate: float = setting(1e-3, "code of LEAP", "Adam, policy", above=0, most=1)
     encoder_learning_rate: float = setting(1e-4, "code of RIS", "Adam, images", above=0, most=1)
     random_shift: int = setting(8, "appendix B", "of images, at most (pixels)", least=0)
+    normalise: bool = setting(False, "none", "states by the environment's center and spread")
     image_pooling: int = setting(1, "not in the paper", "side of averaged squares", least=1)
     target_noise: float = setting(0.2, "code of LEAP", "deviation, on target actions", least=0)
     target_noise_bound: float = setting(0.5, "code of LEAP", "bound of that noise", least=0)

@@ -1,5 +1,6 @@
 """From observations to the features that policies and critics read."""
 
+import math
 from collections.abc import Callable
 from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
@@ -15,6 +16,9 @@ from midway.types import Batch, ConfigurationError, EnvSpec, Subgoal
 
 NUM_FEATURES = 16
 """Features of an image (appendix B)."""
+
+LARGEST_FEATURE = 5.0
+"""Bound of normalised entries: an ant on its back lies 20 deviations off."""
 
 T = TypeVar("T")
 
@@ -39,6 +43,10 @@ class EncoderConfig(Protocol):
         """Side of the squares of pixels that are averaged before the convolutions."""
 
     @property
+    def normalise(self) -> bool:
+        """Whether states are read relative to their typical middle and deviation."""
+
+    @property
     def precision(self) -> Precision:
         """Inputs of matrix products are rounded to it."""
 
@@ -47,15 +55,25 @@ class StateEncoder(eqx.Module):
     """States relative to the environment's origin, in its unit: the state itself in most."""
 
     origin: tuple[float, ...] = eqx.field(static=True)
-    unit: float = eqx.field(static=True)
+    unit: float | tuple[float, ...] = eqx.field(static=True)
+    bound: float = eqx.field(static=True, default=math.inf)
 
     def __call__(self, observation: Float[Array, "B S"]) -> Float[Array, "B S"]:
-        """Return (state - origin) / unit."""
-        return (observation - self._shift) / self.unit
+        """Return (state - origin) / unit, within ± bound."""
+        features = (observation - self._shift) / self._unit
+        return features if math.isinf(self.bound) else jnp.clip(features, -self.bound, self.bound)
 
     def states(self, features: Float[Array, "*B S"]) -> Float[Array, "*B S"]:
         """Return the states that features stand for, in the units of the environment."""
-        return features * self.unit + self._shift
+        return features * self._unit + self._shift
+
+    def spread(self, scale: Float[Array, "*B S"]) -> Float[Array, "*B S"]:
+        """Return scales of features in the units of the environment."""
+        return scale * self._unit
+
+    @property
+    def _unit(self) -> Float[Array, "..."]:
+        return jnp.asarray(self.unit)
 
     @property
     def _shift(self) -> Float[Array, "..."]:
@@ -111,6 +129,10 @@ class ImageEncoder(eqx.Module):
         """Return the features: they are not decoded here."""
         return features
 
+    def spread(self, scale: Float[Array, "*B 16"]) -> Float[Array, "*B 16"]:
+        """Return the scales of features as they are."""
+        return scale
+
     def augment(
         self, image: UInt8[Array, "B H W 3"], key: Key[Array, ""]
     ) -> UInt8[Array, "B H W 3"]:
@@ -151,6 +173,8 @@ def create(spec: EnvSpec, config: EncoderConfig, key: Key[Array, ""]) -> Encoder
                 f"and leave {SMALLEST_IMAGE}"
             )
         return ImageEncoder(spec.observation_shape, config, key=key)
+    if config.normalise and spec.spread:
+        return StateEncoder(spec.center, spec.spread, LARGEST_FEATURE)
     return StateEncoder(spec.origin, spec.unit)
 
 
@@ -159,6 +183,12 @@ def feature_sizes(spec: EnvSpec) -> tuple[int, int]:
     if spec.is_image:
         return NUM_FEATURES, NUM_FEATURES
     return spec.observation_shape[0], spec.goal_shape[0]
+
+
+def scale(encoder: Encoder) -> float:
+    """Return how many of the environment's units one unit of the first feature is."""
+    unit = getattr(encoder, "unit", 1.0)
+    return float(unit[0] if isinstance(unit, tuple) else unit)
 
 
 def subgoal_size(spec: EnvSpec) -> int:

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import optax
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Int, PyTree
 
 Network = TypeVar("Network", bound=PyTree)
 State = TypeVar("State")
@@ -64,3 +64,9 @@ def step_critic_and_encoder(
         encoder=encoder[0],
         encoder_optimizer=encoder[1],
     ), others
+
+
+def updates(state: optax.OptState) -> Int[Array, ""]:
+    """Return how many steps were taken."""
+    count: Int[Array, ""] = optax.tree_utils.tree_get(state, "count")
+    return count

@@ -14,6 +14,7 @@ from midway.functional import (
     laplace_log_density,
     tanh_log_determinant,
 )
+from midway.networks.inputs import PairInputs
 from midway.networks.mlp import MLP, Precision
 
 
@@ -67,6 +68,7 @@ class GaussianPolicy(eqx.Module):
     """π_θ(a | s, g) = tanh N(μ_θ(s, g), Σ_θ(s, g)) (appendix B, actor-critic)."""
 
     network: MLP
+    inputs: PairInputs
 
     def __init__(
         self,
@@ -76,12 +78,14 @@ class GaussianPolicy(eqx.Module):
         precision: Precision,
         *,
         key: Key[Array, ""],
+        inputs: PairInputs | None = None,
     ) -> None:
+        self.inputs = inputs or PairInputs()
         self.network = MLP(input_size, hidden, 2 * action_dim, precision, key=key)
 
     def __call__(self, observation: Float[Array, "..."], goal: Float[Array, "..."]) -> Gaussian:
         """Return the distribution of pre-tanh actions; inputs may broadcast as in `MLP`."""
-        mean, log_std = jnp.split(self.network(observation, goal), 2, axis=-1)
+        mean, log_std = jnp.split(self.network(*self.inputs(observation, goal)), 2, axis=-1)
         return Gaussian(mean, jnp.clip(log_std, LOG_SCALE_MIN, LOG_SCALE_MAX))
 
 
@@ -89,6 +93,7 @@ class SubgoalPolicy(eqx.Module):
     """π^H_ψ(s_g | s, g), the high-level policy: a Laplace over states (appendix B)."""
 
     network: MLP
+    inputs: PairInputs
 
     def __init__(
         self,
@@ -98,10 +103,12 @@ class SubgoalPolicy(eqx.Module):
         precision: Precision,
         *,
         key: Key[Array, ""],
+        inputs: PairInputs | None = None,
     ) -> None:
+        self.inputs = inputs or PairInputs()
         self.network = MLP(input_size, hidden, 2 * subgoal_size, precision, key=key)
 
     def __call__(self, observation: Float[Array, "..."], goal: Float[Array, "..."]) -> Laplace:
         """Return the distribution of subgoals between each observation and goal."""
-        location, log_scale = jnp.split(self.network(observation, goal), 2, axis=-1)
+        location, log_scale = jnp.split(self.network(*self.inputs(observation, goal)), 2, axis=-1)
         return Laplace(location, jnp.clip(log_scale, LOG_SCALE_MIN, LOG_SCALE_MAX))

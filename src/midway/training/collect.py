@@ -41,6 +41,8 @@ class Collector:
         observation: The newest observations.
         begun: Environments in which the last step was followed by a new episode.
         counts: Episodes that ended since the last row of metrics.
+        limit: Steps after which an episode is cut off, if that is before the environment's own; 0
+            for never.
         logged: Sum and number over the steps since then of each info that the environment wants
             logged, by its name in ``metrics.csv``.
     """
@@ -49,6 +51,7 @@ class Collector:
     observation: dict[str, Any]
     begun: np.ndarray[Any, np.dtype[np.bool_]]
     counts: EpisodeCounts = field(default_factory=EpisodeCounts)
+    limit: int = 0
     logged: dict[str, np.ndarray[Any, np.dtype[np.float64]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -71,6 +74,8 @@ class Collector:
         everyone = np.ones(self.env.num_envs, np.bool_)
         replay = step.add(replay, actions, self.observation, everyone)
         ended = terminated | truncated
+        if self.limit:
+            ended = ended | (info["elapsed_steps"] >= self.limit)
         if ended.any():
             self.counts.episodes += int(ended.sum())
             self.counts.successes += int(terminated.sum())
@@ -121,8 +126,10 @@ class Collector:
         logged = {name: np.array(value) for name, value in state.get("logged", {}).items()}
         everyone = np.ones(env.num_envs, np.bool_)
         if env.resumable:
-            return Collector(env, dict(state["observation"]), ~everyone, counts, logged), replay
+            return Collector(
+                env, dict(state["observation"]), ~everyone, counts, logged=logged
+            ), replay
         observation, _ = env.reset()
-        return Collector(env, observation, everyone, counts, logged), step.begin(
+        return Collector(env, observation, everyone, counts, logged=logged), step.begin(
             replay, observation, everyone
         )

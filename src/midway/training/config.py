@@ -44,6 +44,9 @@ class TrainConfig:
     )
     log_every: int = setting(1_000, "ours", "environment steps", least=1)
     checkpoint_every: int = setting(50_000, "ours", "environment steps", least=1)
+    collect_limit: int = setting(
+        0, "not in the paper", "steps of an episode in collection; 0: the environment's", least=0
+    )
     devices: int = setting(1, "ours", "accelerators that batch and replay are split over", least=1)
     task: str = setting("uniform", "appendix C", "starts and goals that are trained on")
 

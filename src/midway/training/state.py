@@ -154,6 +154,7 @@ def _begin(
     totals = step.empty_totals(setup.agent, program, arrays, train, replay)
     streams = devices.copied(seeds.training(setup.seed))
     collector, replay = Collector.start(env, replay, streams.env)
+    collector.limit = train.collect_limit
     parts = (program, arrays, devices.copied(totals), replay, (), collector, streams)
     training = Training(setup, *parts, encoder, counters)
     training.memory = training.begin_episodes(train.num_envs)
@@ -263,6 +264,7 @@ def load_state_dict(training: Training, state: dict[str, Any]) -> None:
     training.collector, training.replay = Collector.restore(
         training.collector.env, replay, state["collector"]
     )
+    training.collector.limit = training.setup.train.collect_limit
     fresh = training.begin_episodes(training.setup.train.num_envs)
     training.memory = acting.renew(training.memory, fresh, training.collector.begun)
     stored = state["counters"]

@@ -16,7 +16,7 @@ from midway.replay.storage import ReplayState
 from midway.training import acting
 from midway.training.config import TrainConfig
 from midway.training.devices import Devices, compile_by_lane
-from midway.types import EnvSpec, Metrics
+from midway.types import EnvSpec, Metrics, Sampling
 
 Arrays: TypeAlias = PyTree
 """The arrays of an agent's state; what is static in it is compiled in."""
@@ -58,6 +58,7 @@ def create_state(agent: AnyAgent, config: Any, spec: EnvSpec, key: Key[Array, ""
 def compile_program(agent: AnyAgent, static: Any, config: TrainConfig, devices: Devices) -> Program:
     """Return the agent's compiled functions; each is traced once for the run's shapes."""
     spec, size = static.spec, batch_size(config, static.spec)
+    wanted = sampling(agent, static)
 
     def train(
         arrays: Arrays, totals: Metrics, replay: ReplayState, key: Key[Array, ""], updates: Any
@@ -65,7 +66,7 @@ def compile_program(agent: AnyAgent, static: Any, config: TrainConfig, devices: 
         def one(carry: tuple[Arrays, Metrics], count: Any) -> tuple[tuple[Arrays, Metrics], None]:
             arrays, totals = carry
             sample_key, update_key = jax.random.split(jax.random.fold_in(key, count))
-            batch = buffer.sample(replay, spec, config.relabel, size, sample_key)
+            batch = buffer.sample(replay, spec, config.relabel, size, sample_key, wanted)
             # Whole first: what to draw is then computed on every device, and only rows are sent.
             batch = devices.split_inside(devices.copied_inside(batch))
             state, metrics = agent.update(eqx.combine(arrays, static), batch, update_key)
@@ -88,6 +89,11 @@ def compile_program(agent: AnyAgent, static: Any, config: TrainConfig, devices: 
     )
 
 
+def sampling(agent: AnyAgent, static: Any) -> Sampling:
+    """Return what the agent wants of a batch."""
+    return agent.sampling(static.config) if agent.sampling else Sampling()
+
+
 def batch_size(config: TrainConfig, spec: EnvSpec) -> int:
     """Return how many transitions an update draws: fewer, if asked, where it encodes images."""
     return (config.encoder_batch_size if spec.is_image else 0) or config.batch_size
@@ -100,7 +106,8 @@ def empty_totals(
     spec = program.spec
 
     def metrics(arrays: Arrays, replay: ReplayState, key: Key[Array, ""]) -> Metrics:
-        batch = buffer.sample(replay, spec, config.relabel, batch_size(config, spec), key)
+        size, wanted = batch_size(config, spec), sampling(agent, program.static)
+        batch = buffer.sample(replay, spec, config.relabel, size, key, wanted)
         return agent.update(program.state(arrays), batch, key)[1]
 
     shapes = jax.eval_shape(metrics, arrays, replay, jax.random.key(0))
