@@ -79,6 +79,7 @@ class Stage:
         for artist in moving:
             artist.set_animated(True)
         figure.set_dpi(PIXELS)
+        style.settle(figure)
         self._canvas = cast(Any, figure.canvas)
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(figure.bbox)

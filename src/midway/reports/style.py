@@ -145,10 +145,28 @@ def legend_below(drawn: Figure, handles: Sequence[Any], title: str = "") -> None
     )
 
 
+def settle(drawn: Figure) -> None:
+    """Find the places of the panels, once, so that all words are on the canvas.
+
+    A panel of a fixed aspect would be measured while it is smaller than its place, and what is
+    missing around it would be taken for room for titles: it is measured as large as its place.
+    """
+    engine = drawn.get_layout_engine()
+    assert engine is not None
+    aspects = {axes: axes.get_aspect() for axes in drawn.axes}
+    for axes in aspects:
+        axes.set_aspect("auto")
+    engine.execute(drawn)
+    drawn.set_layout_engine("none")
+    for axes, aspect in aspects.items():
+        axes.set_aspect(aspect)
+
+
 def save(drawn: Figure, path: Path) -> list[Path]:
     """Write ``path`` as PNG and as SVG; return both files."""
     files = [path.with_name(path.name + suffix) for suffix in (".png", ".svg")]
+    drawn.set_dpi(RESOLUTION)
+    settle(drawn)
     drawn.savefig(files[0], dpi=RESOLUTION, facecolor="white")
-    drawn.set_layout_engine("none")  # the places of the panels are found; once is enough
     drawn.savefig(files[1], dpi=RESOLUTION, facecolor="white", metadata={"Date": None})
     return files
