@@ -9,14 +9,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from midway import tables
 from midway.envs import registry as environments
 from midway.envs.geodesic import geodesic_distance
 from midway.envs.mazes import ROBOT_RADIUS, Maze
+from midway.envs.views import MazeView, TableView
 from midway.networks.decoder import ImageDecoder
-from midway.reports import contract, decoder, recordings
-from midway.reports.contract import MazeView, Policy, Table, TableView
+from midway.reports import decoder, recordings
 from midway.reports.recordings import Recording, record
 from midway.reports.runs import Group, RunData
+from midway.runs import policy as policies
+from midway.runs.policy import Policy
+from midway.tables import Table
 from midway.types import ConfigurationError
 
 SEED = 20_210_718
@@ -77,7 +81,7 @@ class Study:
     def __init__(self, run: RunData, folder: Path) -> None:
         self.run = run
         self.agent = run.agent
-        self.view = contract.view(run.config.env)
+        self.view = run.view
         self._folder = folder
 
     @property
@@ -88,7 +92,7 @@ class Study:
     @property
     def plans(self) -> bool:
         """Whether the agent plans subgoals as it acts."""
-        return self.agent.memory is not None and self.agent.memory.plan is not None
+        return recordings.plans(self.agent)
 
     @property
     def where(self) -> str:
@@ -102,7 +106,7 @@ class Study:
         Raises:
             ConfigurationError: It is damaged or foreign.
         """
-        return contract.load(self.run.folder)
+        return policies.load(self.run.folder)
 
     @property
     def maze(self) -> Maze:
@@ -203,7 +207,7 @@ class Study:
     def _policy_of(self, weights: Path) -> Policy:
         if weights == self.run.folder.policy_weights:
             return self.policy
-        return contract.load(self.run.folder, weights)
+        return policies.load(self.run.folder, weights)
 
     def _snapshots(self) -> dict[int, Path]:
         """Return weights by step: some of the past, and the newest."""
@@ -242,8 +246,8 @@ class Study:
             digest.update(file.read_bytes())
         path = self._folder / f"{self.run.name}-{digest.hexdigest()[:10]}-{name}.csv"
         if not path.exists():
-            contract.write(path, compute())
-        return contract.read(path)
+            tables.write(path, compute())
+        return tables.read(path)
 
     def _episode_table(self) -> Table:
         position, episodes = self._maze_view.position, self.recordings

@@ -10,12 +10,13 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from midway.envs.push import GOAL_THRESHOLD
+from midway.envs.views import TableView
 from midway.reports import style
 from midway.reports.cache import Cache
-from midway.reports.contract import Table, TableView
 from midway.reports.runs import Group, Runs
 from midway.reports.statistics import Curve, Run, curve
 from midway.reports.style import Picture, thousands
+from midway.tables import Table
 
 Column: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
 

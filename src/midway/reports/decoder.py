@@ -17,11 +17,13 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Key, Shaped, UInt8
 
+from midway.agent import Encoder, PretrainSettings
 from midway.envs import registry as environments
 from midway.networks.decoder import ImageDecoder, loss
-from midway.reports.contract import Policy, load_arrays, sample_states, save_arrays
-from midway.training.arrays import named_arrays
-from midway.training.folder import RunFolder
+from midway.runs.folder import RunFolder
+from midway.runs.policy import Policy
+from midway.training.arrays import load_arrays, named_arrays, save_arrays
+from midway.training.pretrain import sample_states
 from midway.types import ConfigurationError
 
 VERSION = 2
@@ -41,7 +43,6 @@ LEARNING_RATE = 1.5e-3
 """Adam's rate at the start; it falls to 0 along a cosine."""
 
 Images: TypeAlias = Shaped[np.ndarray, "B H W 3"]
-Encoder: TypeAlias = Callable[[Any], Any]
 Fit: TypeAlias = tuple[ImageDecoder, optax.OptState]
 
 
@@ -166,7 +167,8 @@ def sample_images(env: Any, count: int, seed: int) -> UInt8[np.ndarray, "N 84 84
         count: Number of images.
         seed: Seed of starts, goals and actions.
     """
-    states = np.asarray(sample_states(env, count - count // 4, ACTIONS, seed).observation)
+    settings = PretrainSettings((), count - count // 4, ACTIONS, rounds=0)
+    states = np.asarray(sample_states(env, settings, seed).observation)
     resets = range(-(-(count // 4) // env.num_envs))
     goals = [env.reset()[0]["desired_goal"] for _ in resets]
     return np.concatenate([states, *goals])[:count]

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from midway.envs.views import MazeView
 from midway.reports import style
 from midway.reports.cache import Cache, Episode
-from midway.reports.contract import MazeView
 from midway.reports.runs import Group, Runs
 from midway.reports.statistics import bootstrap, interquartile_mean, wilson
 from midway.reports.style import Picture

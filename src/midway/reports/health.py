@@ -13,9 +13,9 @@ from matplotlib.lines import Line2D
 
 from midway.reports import style
 from midway.reports.cache import Cache
-from midway.reports.contract import Table
 from midway.reports.runs import Group, RunData, Runs
 from midway.reports.style import Picture, thousands
+from midway.tables import Table
 
 COLUMNS = 3
 

@@ -9,16 +9,19 @@ from jaxtyping import Float, Shaped
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from midway.agent import PretrainSettings
 from midway.envs import registry as environments
+from midway.envs.views import MazeView, TableView
 from midway.networks.decoder import ImageDecoder
 from midway.reports import maze as maps
 from midway.reports import style
 from midway.reports.cache import SEED, Cache, Study
-from midway.reports.contract import MazeView, Policy, TableView, sample_states
 from midway.reports.decoder import Images, as_images, decoded, reconstructed
 from midway.reports.recordings import draws
 from midway.reports.runs import Group, Runs
 from midway.reports.style import Picture
+from midway.runs.policy import Policy
+from midway.training.pretrain import sample_states
 
 Rows: TypeAlias = Mapping[str, Images]
 """Images of every configuration, by the name of their row."""
@@ -166,7 +169,7 @@ def reconstructions(
     """Return new states and what is left of them after encoding and decoding."""
     env = environments.make_vec(policy.config.env, num_envs=IMAGES)
     count = IMAGES if policy.spec.is_image else STATES
-    states = sample_states(env, count, ACTIONS, SEED)
+    states = sample_states(env, PretrainSettings((), count, ACTIONS, rounds=0), SEED)
     kept = _reconstructed(policy.agent.pretrain.reconstruct, policy.state, states)
     return np.asarray(states.observation), np.asarray(kept)
 

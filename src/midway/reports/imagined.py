@@ -11,12 +11,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from midway.envs.mazes import Maze
+from midway.envs.views import MazeView
 from midway.reports import maze as maps
 from midway.reports import style
 from midway.reports.cache import Cache, Study, grid
-from midway.reports.contract import MazeView, Table
 from midway.reports.runs import Group, Row, Runs, row
 from midway.reports.style import Picture, thousands
+from midway.tables import Table
 
 HEAT = LinearSegmentedColormap.from_list(
     "heat", [(0.90, 0.62, 0.0, 0.0), (0.90, 0.62, 0.0, 0.75), (0.84, 0.37, 0.0, 0.95)]

@@ -12,9 +12,9 @@ from matplotlib.patches import Rectangle as Patch
 from matplotlib.ticker import MultipleLocator
 
 from midway.envs.mazes import Maze
+from midway.envs.views import MazeView
 from midway.reports import style
 from midway.reports.cache import Cache, Episode, Study
-from midway.reports.contract import MazeView
 from midway.reports.runs import Group, Runs, row
 from midway.reports.style import Picture
 

@@ -8,8 +8,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from midway.agent import AnyAgent, SubgoalDistribution
 from midway.envs import registry as environments
-from midway.reports.contract import Policy, SubgoalDistribution, rollout
+from midway.runs.policy import Policy
+from midway.training.evaluate import rollout
 
 Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
 
@@ -116,16 +118,17 @@ def _reset(env: Any, tasks: Array, seed: int) -> dict[str, Array]:
     return observation
 
 
-def plans(policy: Policy) -> bool:
-    """Return whether the agent plans subgoals as it acts."""
-    return policy.agent.memory is not None and policy.agent.memory.plan is not None
+def plans(agent: AnyAgent) -> bool:
+    """Return whether an agent plans subgoals as it acts."""
+    return agent.memory is not None and agent.memory.plan is not None
 
 
 def plan(policy: Policy, memory: Any) -> Array | None:
     """Return the planned subgoals ``(B, N, G)`` that a memory holds; None if there are none."""
-    if not plans(policy):
+    ability = policy.agent.memory
+    if ability is None or ability.plan is None:
         return None
-    return np.asarray(_plan(policy.agent.memory.plan, policy.state, memory))
+    return np.asarray(_plan(ability.plan, policy.state, memory))
 
 
 @eqx.filter_jit

@@ -8,11 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from midway.envs.registry import ENVIRONMENTS
-from midway.reports import contract, style
-from midway.reports.contract import MazeView, Table, TableView
-from midway.reports.contract import read as read_table
-from midway.training.folder import RunConfig, RunFolder, read_json
+from midway import tables
+from midway.agent import AnyAgent
+from midway.agents import registry as agents
+from midway.envs import registry as environments
+from midway.envs.views import View
+from midway.reports import style
+from midway.runs.folder import RunConfig, RunFolder, read_json, run_name
+from midway.tables import Table
 from midway.types import ConfigurationError
 
 Row: TypeAlias = dict[str, float]
@@ -77,12 +80,19 @@ class RunData:
     @property
     def name(self) -> str:
         """The run in file names."""
-        return style.file_name(f"{self.config.env}-{self.config.agent}-seed{self.config.seed}")
+        return style.file_name(run_name(self.config.env, self.config.agent, self.config.seed))
 
     @property
-    def agent(self) -> Any:
+    def agent(self) -> AnyAgent:
         """The agent, which says what it is able to."""
-        return contract.agent(self.config.agent)
+        return agents.get(self.config.agent)
+
+    @property
+    def view(self) -> View | None:
+        """How the environment is drawn; None if nobody knows."""
+        with suppress(ConfigurationError):  # its package may be missing here
+            return environments.entry(self.config.env).view
+        return None
 
     def evaluated(self, task: str, actions: str) -> Table:
         """Return the evaluations of one task with one kind of action."""
@@ -134,9 +144,9 @@ class Runs:
         return style.file_name(self.env)
 
     @property
-    def view(self) -> MazeView | TableView | None:
+    def view(self) -> View | None:
         """How the environment is drawn; None if nobody knows."""
-        return contract.view(self.env)
+        return self.groups[0].runs[0].view
 
 
 def read(path: Path) -> RunData:
@@ -152,8 +162,8 @@ def read(path: Path) -> RunData:
         folder,
         config,
         record,
-        read_table(folder.metrics_file),
-        read_table(folder.evaluation_file),
+        tables.read(folder.metrics_file),
+        tables.read(folder.evaluation_file),
     )
 
 
@@ -164,7 +174,7 @@ def row(table: Table, place: int) -> Row:
 
 def by_environment(runs: Sequence[RunData]) -> list[Runs]:
     """Return the runs of every environment, in the order of the registry and then by name."""
-    known = list(ENVIRONMENTS)
+    known = list(environments.ENVIRONMENTS)
     names = {run.config.env for run in runs}
     ordered = sorted(names, key=lambda name: (name not in known, *_place(known, name), name))
     return [Runs(name, groups([run for run in runs if run.config.env == name])) for name in ordered]

@@ -11,12 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from midway.reports import contract, decoder, style, tabletop
+from midway.envs import registry as environments
+from midway.envs.views import MazeView, TableView
+from midway.reports import decoder, style, tabletop
 from midway.reports import maze as maps
-from midway.reports.contract import MazeView, Policy, TableView
 from midway.reports.decoder import Images
 from midway.reports.recordings import Recording, imagined, in_every_state, plans
-from midway.training.folder import RunFolder
+from midway.runs.folder import RunFolder
+from midway.runs.policy import Policy
 from midway.types import ConfigurationError
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
@@ -54,7 +56,7 @@ def maker(folder: RunFolder, policy: Policy, title: str) -> MakeScene:
     Raises:
         ConfigurationError: There is no scene of the policy's environment.
     """
-    view = contract.view(policy.config.env)
+    view = environments.entry(policy.config.env).view
     if isinstance(view, MazeView):
         return lambda recording: MazeScene(view, title, policy, recording)
     if isinstance(view, TableView) and policy.spec.is_image:
@@ -288,7 +290,7 @@ def decoding(folder: RunFolder, policy: Policy) -> Callable[[Recording], Images 
     """
     if decoder.encoder_of(policy) is None:
         return lambda recording: None
-    if not plans(policy) and policy.agent.subgoals is None:
+    if not plans(policy.agent) and policy.agent.subgoals is None:
         return lambda recording: None
     fitted = decoder.of_policy(folder, policy)
 

@@ -12,13 +12,14 @@ from matplotlib.patches import Circle
 from matplotlib.patches import Rectangle as Patch
 
 from midway.envs.push_scene import HAND_BOX
+from midway.envs.views import TableView
 from midway.reports import maze as maps
 from midway.reports import style
 from midway.reports.cache import ON_TABLE, Cache, Study
-from midway.reports.contract import Policy, TableView
 from midway.reports.recordings import Recording, in_every_state
 from midway.reports.runs import Group, Runs
 from midway.reports.style import Picture
+from midway.runs.policy import Policy
 
 HAND, PUCK = TableView.hand, TableView.puck
 """x and y of the hand and of the puck in a state (m)."""

@@ -13,10 +13,11 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
-from midway.reports import contract, scenes
+from midway.reports import scenes
 from midway.reports.recordings import Recording, record
 from midway.reports.runs import RunData, agent_labels, read
 from midway.reports.scenes import Frame, Scene
+from midway.runs import policy as policies
 from midway.types import ConfigurationError
 
 SECONDS = 8
@@ -90,7 +91,7 @@ def film(
     """
     if episodes < 1:
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
-    policy = contract.load(run.folder)
+    policy = policies.load(run.folder)
     (label,) = agent_labels([run.config.agent])
     title = f"{label} on {run.config.env}, {task}"
     make = scenes.maker(run.folder, policy, title)
