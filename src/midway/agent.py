@@ -6,18 +6,19 @@ whoever needs it asks for the field, never for a name.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
-from jaxtyping import Array, Float, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Key, PyTree, Shaped
 
-from midway.types import Batch, EnvSpec, Metrics, Sampling, Subgoal
+from midway.types import AnyArray, Batch, EnvSpec, Hyperparameters, Metrics, Sampling, Subgoal
 
 
+@runtime_checkable
 class AgentState(Protocol):
     """What every agent's state holds besides its networks and optimisers."""
 
     @property
-    def config(self) -> Any:
+    def config(self) -> Hyperparameters:
         """The agent's configuration, a static part of the state."""
 
     @property
@@ -75,7 +76,7 @@ class EpisodeMemory(Generic[ConfigT, StateT]):
     act: Callable[
         [StateT, Memory, Inputs, Inputs, Key[Array, ""], bool], tuple[Float[Array, "B A"], Memory]
     ]
-    rest: Callable[[Memory, Any], Memory] | None = None
+    rest: Callable[[Memory, Bool[AnyArray, " B"]], Memory] | None = None
     plan: Callable[[StateT, Memory], Float[Array, "B N G"]] | None = None
 
 

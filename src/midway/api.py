@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from midway import presets
 from midway.agent import AnyAgent
@@ -18,7 +17,7 @@ from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.logging import Logger
 from midway.training.progress import Reporter, Silent, reporter
 from midway.training.state import Training
-from midway.types import ConfigurationError
+from midway.types import ConfigurationError, VectorGoalEnv
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +38,7 @@ def configure(
     agent: str | AnyAgent = "ris",
     preset: str = "quick",
     seed: int = 0,
-    changes: Mapping[str, Any] | None = None,
+    changes: Mapping[str, object] | None = None,
 ) -> RunConfig:
     """Return a preset with some values changed.
 
@@ -71,7 +70,7 @@ def train(
     num_envs: int | None = None,
     out: str | Path | None = None,
     precision: str | None = None,
-    changes: Mapping[str, Any] | None = None,
+    changes: Mapping[str, object] | None = None,
     progress: bool = False,
 ) -> Run:
     """Train an agent on an environment and write a run folder.
@@ -123,7 +122,7 @@ def resume(
     folder = RunFolder(Path(path))
     config = folder.load_config()
     named = {"steps": steps, "devices": devices}
-    given: dict[str, Any] = {name: int(v) for name, v in named.items() if v is not None}
+    given = {name: int(v) for name, v in named.items() if v is not None}
     config = dataclasses.replace(config, train=dataclasses.replace(config.train, **given))
     setup = setup_of(config, folder)
     folder.note_resume(config)
@@ -169,7 +168,7 @@ def evaluate(
 def setup_of(config: RunConfig, folder: RunFolder) -> state.Setup:
     """Return what the run of this configuration is made of; nothing is written."""
 
-    def make_env(num_envs: int, task: str) -> Any:
+    def make_env(num_envs: int, task: str) -> VectorGoalEnv:
         return environments.make_vec(config.env, num_envs=num_envs, task=task)
 
     agent = agents.get(config.agent)

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from midway import settings
 from midway.agents import registry as agents
@@ -19,9 +19,9 @@ from midway.envs import registry as environments
 from midway.envs.registry import Declaration
 from midway.networks.mlp import fastest_precision
 from midway.training.config import TrainConfig
-from midway.types import ConfigurationError, RelabelMix
+from midway.types import ConfigurationError, Hyperparameters, RelabelMix
 
-Values: TypeAlias = Mapping[str, Any]
+Values: TypeAlias = Mapping[str, object]
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Resolved(NamedTuple):
     """
 
     train: TrainConfig
-    hyperparameters: Any
+    hyperparameters: Hyperparameters
     sources: dict[str, Source]
 
 
@@ -345,7 +345,7 @@ def resolve(env: str, agent: str, preset: str = "quick", changes: Values | None 
     if base == "quick":
         chosen = [*_of_this_machine(declaration, sources), *chosen]
     given = Rule("*", changes or {}, "given")
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for rule in (*chosen, given):
         values |= rule.values
         sources |= dict.fromkeys(rule.values, Source(rule.source, rule.deviates))

@@ -7,12 +7,12 @@ import ast
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
-from midway.types import ConfigurationError
+from midway.types import ConfigurationError, Hyperparameters
 
 T = TypeVar("T")
-Config = TypeVar("Config")
+Config = TypeVar("Config", bound=Hyperparameters)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Allowed:
     above: float | None = None
     most: float | None = None
     below: float | None = None
-    choices: tuple[Any, ...] = ()
+    choices: tuple[object, ...] = ()
 
-    def complaint(self, value: Any) -> str:
+    def complaint(self, value: object) -> str:
         """Return what is wrong with a value of the right type, or nothing."""
         if self.choices:
             listed = ", ".join(map(str, self.choices))
@@ -86,18 +86,18 @@ def setting(default: T, source: str = "", meaning: str = "", **allowed: Any) -> 
     return field
 
 
-def names(config: Any) -> tuple[str, ...]:
+def names(config: Hyperparameters) -> tuple[str, ...]:
     """Return the names of a configuration's settings."""
     return tuple(field.name for field in dataclasses.fields(config))
 
 
-def declared(config: Any) -> Iterator[tuple[str, Any, Allowed]]:
+def declared(config: Hyperparameters) -> Iterator[tuple[str, object, Allowed]]:
     """Yield name, value and what is allowed of each setting of a configuration."""
     for field in dataclasses.fields(config):
         yield field.name, getattr(config, field.name), field.metadata.get("allowed", Allowed())
 
 
-def check(config: Any) -> None:
+def check(config: Hyperparameters) -> None:
     """Check every setting against what its field allows.
 
     Raises:
@@ -112,7 +112,7 @@ def check(config: Any) -> None:
             raise ConfigurationError(f"{name} {value}: {complaint}")
 
 
-def changed(config: Config, changes: Mapping[str, Any]) -> Config:
+def changed(config: Config, changes: Mapping[str, object]) -> Config:
     """Return the configuration with some values replaced, each in the type of the old one.
 
     Args:
@@ -124,10 +124,12 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
     """
     [known] = split(changes, [config])
     values = {name: _converted(name, getattr(config, name), new) for name, new in known.items()}
-    return cast(Config, dataclasses.replace(cast(Any, config), **values))
+    return dataclasses.replace(config, **values)
 
 
-def split(changes: Mapping[str, Any], configs: Sequence[Any]) -> list[dict[str, Any]]:
+def split(
+    changes: Mapping[str, object], configs: Sequence[Hyperparameters]
+) -> list[dict[str, object]]:
     """Return for each configuration the changes that it has a field for.
 
     Raises:
@@ -141,7 +143,7 @@ def split(changes: Mapping[str, Any], configs: Sequence[Any]) -> list[dict[str, 
     return [{n: v for n, v in changes.items() if n in fields} for fields in known]
 
 
-def _converted(name: str, old: Any, value: Any) -> Any:
+def _converted(name: str, old: object, value: object) -> object:
     """Return the value in the type of the old one."""
     if isinstance(value, str) and not isinstance(old, str):
         try:
@@ -149,7 +151,7 @@ def _converted(name: str, old: Any, value: Any) -> Any:
         except (ValueError, SyntaxError):
             raise ConfigurationError(f"{name} {value!r}: not a {type(old).__name__}") from None
     if dataclasses.is_dataclass(old) and not isinstance(value, type(old)):
-        return _of_parts(name, type(old), value)
+        return _of_parts(name, old, value)
     if isinstance(old, tuple) and isinstance(value, list):
         value = tuple(value)
     if isinstance(old, float) and type(value) is int:
@@ -163,14 +165,14 @@ def _converted(name: str, old: Any, value: Any) -> Any:
     return value
 
 
-def _example(old: tuple[Any, ...]) -> Any:
+def _example(old: tuple[object, ...]) -> object:
     return old[0] if old else 1
 
 
-def _of_parts(name: str, kind: Any, value: Any) -> Any:
+def _of_parts(name: str, old: Hyperparameters, value: Any) -> Hyperparameters:
     """Return a group of settings, such as the relabelling shares, from its parts."""
     try:
-        return kind(**value) if isinstance(value, Mapping) else kind(*value)
+        return type(old)(**value) if isinstance(value, Mapping) else type(old)(*value)
     except TypeError:
-        listed = ", ".join(names(kind))
+        listed = ", ".join(names(old))
         raise ConfigurationError(f"{name} {value!r}: one value for each of {listed}") from None

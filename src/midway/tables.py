@@ -1,15 +1,15 @@
 """CSV files: whole tables, and rows that are appended as a run goes on."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
-from midway.types import ConfigurationError
+from midway.types import ConfigurationError, NumPyArray
 
-Table: TypeAlias = dict[str, np.ndarray[Any, np.dtype[Any]]]
+Table: TypeAlias = dict[str, NumPyArray]
 """Columns by name: float64, or text for the columns of ``TEXT_COLUMNS``."""
 
 TEXT_COLUMNS = ("task", "actions")
@@ -39,7 +39,7 @@ def read(path: Path) -> Table:
         raise ConfigurationError(f"{path} cannot be read: {error}") from error
 
 
-def write(path: Path, table: Mapping[str, np.ndarray[Any, np.dtype[Any]]]) -> None:
+def write(path: Path, table: Mapping[str, NumPyArray]) -> None:
     """Write a CSV file that is there whole or not at all; numbers with six digits."""
     path.parent.mkdir(parents=True, exist_ok=True)
     columns = [
@@ -91,7 +91,7 @@ def _rows(path: Path) -> list[list[str]]:
         return list(csv.reader(file))
 
 
-def _replace(path: Path, rows: list[Any]) -> None:
+def _replace(path: Path, rows: Sequence[Sequence[object]]) -> None:
     temporary = path.with_name(path.name + ".new")
     with temporary.open("w", newline="") as file:
         csv.writer(file).writerows(rows)

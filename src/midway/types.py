@@ -1,16 +1,44 @@
 """Containers and contracts that every floor shares."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from dataclasses import Field, asdict, dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
+import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
 Metrics: TypeAlias = dict[str, Float[Array, ""]]
 """Scalars on the device, named ``group/name``."""
 
+NumPyArray: TypeAlias = np.ndarray[Any, np.dtype[Any]]
+AnyArray: TypeAlias = NumPyArray | Array
+"""What is taken by compiled functions."""
+
+OneArray = TypeVar("OneArray", NumPyArray, Array)
+"""NumPy or JAX arrays: the goal task is written for both, and gives what it is given."""
+
 ArrayLike: TypeAlias = Any
-"""A NumPy or JAX array: the goal task is written for both."""
+
+Observation: TypeAlias = Mapping[str, AnyArray]
+"""Goal-environment dictionary: observation, achieved_goal, desired_goal (and the two states)."""
+Observations: TypeAlias = dict[str, NumPyArray]
+"""The same as a vector environment gives it, with one row for each copy."""
+Info: TypeAlias = dict[str, NumPyArray]
+"""What a vector environment says besides, with one value for each copy."""
+Step: TypeAlias = tuple[Observations, NumPyArray, NumPyArray, NumPyArray, Info]
+"""Observations, reward, terminated, truncated and info."""
+Options: TypeAlias = Mapping[str, Any]
+"""What a user wants of a reset, checked by the environment: ``reset_mask``, ``task`` and others."""
+
+JsonObject: TypeAlias = dict[str, Any]
+"""What a JSON file holds; whoever reads it checks the values."""
+
+
+@runtime_checkable
+class Hyperparameters(Protocol):
+    """A frozen dataclass of settings (`midway.settings`)."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
 
 class ConfigurationError(ValueError):
@@ -25,11 +53,11 @@ class NonFiniteError(RuntimeError):
 class GoalTask(Protocol):
     """The one definition of success, shared by collection, replay, evaluation and tests."""
 
-    def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
+    def __call__(self, achieved: OneArray, desired: OneArray) -> tuple[OneArray, OneArray]:
         """Return reward ``(B,)`` float32, terminated ``(B,)`` bool for goals ``(B, goal_dim)``."""
         ...
 
-    def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
+    def distance(self, achieved: OneArray, desired: OneArray) -> OneArray:
         """Return the distance to the goal ``(B,)`` that success is measured by."""
         ...
 
@@ -49,25 +77,25 @@ class DistanceTask:
     threshold: float
     names: tuple[str, ...] = ()
 
-    def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
+    def distance(self, achieved: OneArray, desired: OneArray) -> OneArray:
         """Return the largest of the groups' distances ``(B,)`` (m)."""
         largest, *others = self._distances(achieved, desired)
         for other in others:
             largest = largest * (largest >= other) + other * (other > largest)
         return largest
 
-    def named_distances(self, achieved: ArrayLike, desired: ArrayLike) -> dict[str, ArrayLike]:
+    def named_distances(self, achieved: OneArray, desired: OneArray) -> dict[str, OneArray]:
         """Return the distance of each group ``(B,)`` by its name (m); nothing without names."""
         return dict(zip(self.names, self._distances(achieved, desired), strict=False))
 
-    def _distances(self, achieved: ArrayLike, desired: ArrayLike) -> list[ArrayLike]:
+    def _distances(self, achieved: OneArray, desired: OneArray) -> list[OneArray]:
         difference = achieved - desired
         return [
             sum(difference[..., i] ** 2 for i in group) ** 0.5  # type: ignore[operator]
             for group in self.groups
         ]
 
-    def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
+    def __call__(self, achieved: OneArray, desired: OneArray) -> tuple[OneArray, OneArray]:
         """Return reward ``(B,)``, always -1, and terminated ``(B,)``."""
         distance = self.distance(achieved, desired)
         return (0 * distance - 1).astype("float32"), distance < self.threshold
@@ -77,20 +105,21 @@ class DistanceTask:
 class UnknownTask:
     """Success of an environment whose rule is not stored with the policy."""
 
-    def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
+    def distance(self, achieved: OneArray, desired: OneArray) -> OneArray:
         """Raise a ConfigurationError: only the environment itself can tell."""
         raise ConfigurationError("what counts as reached is known to the environment alone")
 
-    def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
+    def __call__(self, achieved: OneArray, desired: OneArray) -> tuple[OneArray, OneArray]:
         """Raise a ConfigurationError, as ``distance``."""
-        return self.distance(achieved, desired), None
+        distance = self.distance(achieved, desired)
+        return distance, distance
 
 
-def _as_tuple(value: Any) -> Any:
+def _as_tuple(value: object) -> object:
     return tuple(_as_tuple(part) for part in value) if isinstance(value, list | tuple) else value
 
 
-def _as_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+def _as_tuples(values: JsonObject) -> JsonObject:
     return {name: _as_tuple(value) for name, value in values.items()}
 
 
@@ -148,26 +177,68 @@ class EnvSpec:
             image_shape=self.observation_shape,
         )
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return plain values; of the task only what `DistanceTask` holds."""
         values = asdict(self)
         values["task"] = asdict(self.task) if isinstance(self.task, DistanceTask) else None
         return values
 
     @staticmethod
-    def from_json(values: Mapping[str, Any]) -> "EnvSpec":
+    def from_json(values: JsonObject) -> "EnvSpec":
         """Return the specification of ``to_json``; a task that is not there judges nothing.
 
         Raises:
             ConfigurationError: A value is missing, unknown or has the wrong type.
         """
         try:
-            plain = {name: _as_tuple(value) for name, value in values.items()}
+            plain = _as_tuples(values)
             task = plain["task"]
             plain["task"] = UnknownTask() if task is None else DistanceTask(**_as_tuples(task))
             return EnvSpec(**plain)
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigurationError(f"environment not understood: {error}") from error
+
+
+@runtime_checkable
+class VectorGoalEnv(Protocol):
+    """Copies of a goal environment that are stepped together and reset by a mask."""
+
+    @property
+    def goal_spec(self) -> EnvSpec:
+        """What agents may know of the environment."""
+
+    @property
+    def num_envs(self) -> int:
+        """Number of copies."""
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Names of the tasks."""
+
+    @property
+    def resumable(self) -> bool:
+        """Whether ``load_state_dict`` continues in the middle of the episodes."""
+
+    @property
+    def logged_info(self) -> Mapping[str, str]:
+        """Info whose mean over the steps of collection is logged, with its name there."""
+
+    def reset(
+        self, *, seed: int | None = None, options: Options | None = None
+    ) -> tuple[Observations, Info]:
+        """Start new episodes."""
+        ...
+
+    def step(self, actions: NumPyArray) -> Step:
+        """Move every copy by one step."""
+        ...
+
+    def state_dict(self) -> dict[str, NumPyArray]:
+        """Return all that the future depends on."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, NumPyArray]) -> None:
+        """Continue from a ``state_dict``."""
 
 
 class Subgoal(NamedTuple):
@@ -260,7 +331,3 @@ class RelabelMix:
             raise ConfigurationError(
                 f"relabel mix, future_discount {self.future_discount}: must be above 0, at most 1"
             )
-
-
-Observation: TypeAlias = Mapping[str, Any]
-"""Goal-environment dictionary: observation, achieved_goal, desired_goal (and the two states)."""

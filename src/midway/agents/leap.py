@@ -8,7 +8,7 @@ values along start, subgoals and goal is best; the TDM's policy then aims at the
 
 import dataclasses
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -174,7 +174,7 @@ def plan_where_due(
     segment = memory.elapsed // steps
     due = (memory.elapsed % steps == 0) & (segment < state.config.num_subgoals)
 
-    def one(row: tuple[Any, ...]) -> Any:
+    def one(row: tuple[Array, ...]) -> Float[Array, "N L"]:
         due, *inputs = row
         return jax.lax.cond(due, lambda *x: plan(state, *x), lambda *x: x[3], *inputs)
 

@@ -13,23 +13,28 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int, PyTree
 
 from midway import api
 from midway.envs import registry as environments
+from midway.envs.simulation import SimulationVectorEnv
 from midway.replay import buffer
 from midway.replay.storage import num_bytes
 from midway.runs.folder import RunFolder
 from midway.training import loop, state, step
 from midway.training.compilation import give_back_memory
-from midway.types import EnvSpec
+from midway.types import EnvSpec, JsonObject, Metrics
 
-Figures = dict[str, Any]
+Figures: TypeAlias = JsonObject
+"""Figures by name, as they are printed."""
+Piece: TypeAlias = Callable[[], PyTree]
+"""What is timed: returns the arrays that it is done with."""
 
 REPETITIONS = 30
 ROWS = 20_000
@@ -63,7 +68,7 @@ def _processor() -> str:
     return names[0] if names else platform.machine()
 
 
-def medians(pieces: dict[str, Callable[[], Any]], repetitions: int = REPETITIONS) -> Figures:
+def medians(pieces: dict[str, Piece], repetitions: int = REPETITIONS) -> Figures:
     """Return the median time of each piece in milliseconds; the pieces alternate."""
     times: dict[str, list[float]] = {name: [] for name in pieces}
     for piece in pieces.values():
@@ -99,7 +104,7 @@ def update(env: str, agent: str, batch: int, precision: str) -> Figures:
     inputs = (training.arrays, training.totals, training.replay, *arguments)
     flops = _product_flops(training.program.train, inputs)
 
-    def one_update(training: state.Training) -> Any:
+    def one_update(training: state.Training) -> Metrics:
         training.arrays, training.totals = training.program.train(
             training.arrays, training.totals, training.replay, *arguments
         )
@@ -135,7 +140,7 @@ def environment(env: str, num_envs: int) -> Figures:
         env: Environment.
         num_envs: Copies.
     """
-    vector: Any = environments.make_vec(env, num_envs=num_envs)
+    vector = environments.make_vec(env, num_envs=num_envs)
     vector.reset(seed=0)
     generator = np.random.default_rng(0)
     actions = generator.uniform(-1, 1, (num_envs, vector.goal_spec.action_dim)).astype("float32")
@@ -147,13 +152,13 @@ def environment(env: str, num_envs: int) -> Figures:
             if (terminated | truncated).any():
                 vector.reset(options={"reset_mask": terminated | truncated})
 
-    pieces: dict[str, Callable[[], Any]] = {"environment": steps}
-    if hasattr(vector, "batch"):
-        substeps = vector.substeps
+    pieces: dict[str, Piece] = {"environment": steps}
+    if isinstance(vector, SimulationVectorEnv):
+        batch, substeps = vector.batch, vector.substeps
 
         def bare() -> None:
             for _ in range(counts):
-                vector.batch.step(nstep=substeps)
+                batch.step(nstep=substeps)
 
         pieces["bare"] = bare
     times = medians(pieces)
@@ -182,7 +187,7 @@ def replay(env: str, batch: int) -> Figures:
     mix = training.setup.train.relabel
     sample = jax.jit(lambda ring, key: buffer.sample(ring, training.program.spec, mix, batch, key))
 
-    def add() -> Any:
+    def add() -> Int[Array, " K"]:
         training.replay = step.add(training.replay, actions, observation, everyone)
         return training.replay.num_rows
 
@@ -246,11 +251,11 @@ def whole_loop(env: str, agent: str, batch: int, precision: str) -> Figures:
     training = filled(env, agent, batch, precision, updates_per_call=8)
     program = training.program
 
-    def turn() -> Any:
+    def turn() -> Metrics:
         loop.advance(training)
         return training.totals
 
-    def updates() -> Any:
+    def updates() -> Metrics:
         training.arrays, training.totals = program.train(
             training.arrays, training.totals, training.replay, jax.random.key(0), 0
         )
@@ -265,7 +270,12 @@ def whole_loop(env: str, agent: str, batch: int, precision: str) -> Figures:
 
 
 def filled(
-    env: str, agent: str, batch: int, precision: str, updates_per_call: int, **changes: Any
+    env: str,
+    agent: str,
+    batch: int,
+    precision: str,
+    updates_per_call: int,
+    **changes: int | float | str,
 ) -> state.Training:
     """Return a run of 8 environments that writes nothing, just before its first update.
 
@@ -277,7 +287,7 @@ def filled(
         updates_per_call: Updates that one compiled call does.
         changes: Other settings of `midway.training.config.TrainConfig`.
     """
-    settings = {
+    settings: dict[str, object] = {
         "num_envs": 8,
         "batch_size": batch,
         "encoder_batch_size": 0,
@@ -318,12 +328,12 @@ def _fill_with_noise(training: state.Training) -> None:
     training.counters = training.counters._replace(steps=steps)
 
 
-def _product_flops(function: Any, arguments: tuple[Any, ...]) -> float:
+def _product_flops(function: Callable[..., PyTree], arguments: tuple[PyTree, ...]) -> float:
     """Return the floating-point operations of all matrix products in a compiled function."""
     return sum(_products(jax.make_jaxpr(function)(*arguments).jaxpr))
 
 
-def _products(jaxpr: Any) -> list[float]:
+def _products(jaxpr: jax.extend.core.Jaxpr) -> list[float]:
     """Return 2 x outputs x contracted length of each product, also of inner functions and loops."""
     found = []
     for equation in jaxpr.eqns:
@@ -337,7 +347,7 @@ def _products(jaxpr: Any) -> list[float]:
     return found
 
 
-def _reference_product(precision: str) -> Callable[[], Any]:
+def _reference_product(precision: str) -> Piece:
     """Return ten products of 2048 x 256 by 256 x 256 in one call, as a function of no arguments."""
     dtype = jnp.bfloat16 if precision == "bf16" else jnp.float32
     x = jnp.ones((2048, 256), dtype)

@@ -3,7 +3,6 @@
 import statistics
 import time
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -45,7 +44,7 @@ def plan(
         jnp.zeros((config.num_subgoals, config.latent_size)),
         jax.random.key(1),
     )
-    search: Any = eqx.filter_jit(leap.plan)
+    search = eqx.filter_jit(leap.plan)
     compiled = search.lower(state, *inputs).compile()
     times = []
     for _ in range(REPETITIONS):

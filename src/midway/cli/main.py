@@ -5,12 +5,15 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
 from midway.cli.parsing import Count, OptionalCount, parse, plain, settings
 from midway.types import ConfigurationError, NonFiniteError
+
+if TYPE_CHECKING:
+    from midway.api import Run
 
 EXIT_FAILED = 1
 EXIT_USAGE = 2
@@ -227,7 +230,7 @@ def bench(
     from midway.bench import pieces as measure
     from midway.bench import plan as bench_plan
 
-    pieces: dict[str, Callable[[], dict[str, Any]]] = {
+    pieces: dict[str, Callable[[], measure.Figures]] = {
         "update": lambda: measure.update(env, agent, batch, precision),
         "env": lambda: measure.environment(env, num_envs),
         "replay": lambda: measure.replay(env, batch),
@@ -368,10 +371,10 @@ def _run_folders(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-def _print_json(value: Any) -> None:
+def _print_json(value: object) -> None:
     print(json.dumps(value))
 
 
-def _say_where(run: Any) -> None:
+def _say_where(run: "Run") -> None:
     state = "finished" if run.finished else "stopped; continue with: midway resume"
     print(f"{state} {run.path}")

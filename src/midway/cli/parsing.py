@@ -6,12 +6,14 @@ import functools
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, ParamSpec
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from midway.types import ConfigurationError
+
+Arguments = ParamSpec("Arguments")
 
 
 def _whole_number(words: list[str]) -> int:
@@ -22,7 +24,7 @@ def _whole_number(words: list[str]) -> int:
     return int(number)
 
 
-_NUMBER = PrimitiveConstructorSpec[Any](
+_NUMBER = PrimitiveConstructorSpec[int](
     nargs=1,
     metavar="N",
     instance_from_str=_whole_number,
@@ -60,14 +62,14 @@ def parse(
         raise ConfigurationError(_one_line(errors.getvalue())) from None
 
 
-def _delay(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+def _delay(command: Callable[Arguments, None]) -> Callable[Arguments, Callable[[], None]]:
     """Return a function of the same signature that only binds its arguments.
 
     Parsing and running stay apart, so that only messages of the parser are caught.
     """
 
     @functools.wraps(command)
-    def bind(*args: Any, **kwargs: Any) -> Callable[[], None]:
+    def bind(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Callable[[], None]:
         return functools.partial(command, *args, **kwargs)
 
     return bind
@@ -96,6 +98,6 @@ def settings(words: Sequence[str]) -> dict[str, str]:
     return changes
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> object:
     """Return a setting's value as JSON has it: a group of settings as its parts."""
     return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value  # type: ignore[arg-type]

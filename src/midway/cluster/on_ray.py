@@ -47,7 +47,7 @@ def start(
             states[job] = "running"
 
     def collect() -> None:
-        left: list[Any] = list(running)
+        left: list[object] = list(running)
         while left:
             done, left = ray.wait(left)
             for reference in done:
@@ -71,7 +71,7 @@ def _run_to_its_end(job: Job, folder: str) -> bool:
     return execute(job, Path(folder))
 
 
-def _result(ray: Any, reference: Any) -> State:
+def _result(ray: Any, reference: object) -> State:
     try:
         return "finished" if ray.get(reference) else "failed"
     except ray.exceptions.RayError:

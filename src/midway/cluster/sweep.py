@@ -11,12 +11,15 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from midway.cluster import on_ray
 from midway.cluster.jobs import POLL_SECONDS, Job, State, execute, finished, last_success
 from midway.runs.folder import RunFolder
 from midway.types import ConfigurationError
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ def _local_workers(
     return [threading.Thread(target=work, args=(core,), daemon=True) for core in cores]
 
 
-def table(found: Sequence[Status]) -> Any:
+def table(found: Sequence[Status]) -> "Table":
     """Return a table of all jobs for a terminal."""
     from rich.table import Table
 

@@ -14,7 +14,8 @@ from jaxtyping import Float, Float32
 
 from midway.envs.maze_env import MazeVectorEnv, walls_mjcf
 from midway.envs.mazes import MAZES, Maze
-from midway.envs.vector import Array, Observations
+from midway.envs.vector import Array
+from midway.types import Observations
 
 TIMESTEP = 0.03
 """Seconds of one simulation step."""

@@ -1,8 +1,7 @@
 """What the robots in mazes have in common: walls, starts, goals and success."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -11,8 +10,8 @@ from jaxtyping import Float, Float32, Int
 
 from midway.envs.mazes import WALL_HEIGHT, Maze
 from midway.envs.simulation import SimulationVectorEnv
-from midway.envs.vector import Array, Observations
-from midway.types import ConfigurationError, DistanceTask, EnvSpec
+from midway.envs.vector import Array
+from midway.types import ConfigurationError, DistanceTask, EnvSpec, Observations, Options
 
 GOAL_THRESHOLD = 0.5
 """Distance in x-y below which the goal is reached (m); paper, appendix C."""
@@ -103,7 +102,7 @@ class MazeVectorEnv(SimulationVectorEnv):
         observation = self._encode(self._qpos, self._qvel)
         return {"observation": observation, "achieved_goal": observation.copy()}
 
-    def _place(self, copies: Int[Array, " n"], options: Mapping[str, Any]) -> None:
+    def _place(self, copies: Int[Array, " n"], options: Options) -> None:
         given = [self._given(options.get(role), role) for role in ("start", "goal")]
         starts, goals = [], []
         for copy in copies:
@@ -117,7 +116,7 @@ class MazeVectorEnv(SimulationVectorEnv):
         at_rest = np.zeros((len(copies), self._qvel.shape[1]))
         self._goals["desired_goal"][copies] = self._encode(np.stack(goals), at_rest)
 
-    def _given(self, points: Any, role: str) -> list[Float[Array, "2"] | None]:
+    def _given(self, points: object, role: str) -> list[Float[Array, "2"] | None]:
         """Return for each copy the start or goal that the user's options name, if they do.
 
         Raises:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -23,8 +23,8 @@ from midway.envs.push_scene import (
 )
 from midway.envs.rendering import backend, draw
 from midway.envs.simulation import SimulationVectorEnv
-from midway.envs.vector import Array, Observations
-from midway.types import ConfigurationError, DistanceTask, EnvSpec
+from midway.envs.vector import Array
+from midway.types import ConfigurationError, DistanceTask, EnvSpec, Observations, Options
 
 SUBSTEPS = 50
 """Simulation steps for each step: 0.1 s."""
@@ -135,7 +135,7 @@ class PushStateVectorEnv(SimulationVectorEnv):
         # The stage makes the positions of bodies those of the new state.
         self.batch.step(nstep=self.substeps, stage=POSITIONS)
 
-    def _place(self, copies: Int[Array, " n"], options: Mapping[str, Any]) -> None:
+    def _place(self, copies: Int[Array, " n"], options: Options) -> None:
         given = [self._given(options.get(role), role) for role in ("start", "goal")]
         pairs = [
             TASKS[self.task].sample(
@@ -163,7 +163,7 @@ class PushStateVectorEnv(SimulationVectorEnv):
         super().load_state_dict(state)
         self.batch.forward(stage=POSITIONS)
 
-    def _given(self, states: Any, role: str) -> list[Float[Array, "4"] | None]:
+    def _given(self, states: object, role: str) -> list[Float[Array, "4"] | None]:
         """Return for each copy the start or goal that the user's options name, if they do.
 
         Raises:
@@ -230,7 +230,7 @@ class PushVectorEnv(PushStateVectorEnv):
         super()._advance(actions)
         self._outdated[:] = True
 
-    def _place(self, copies: Int[Array, " n"], options: Mapping[str, Any]) -> None:
+    def _place(self, copies: Int[Array, " n"], options: Options) -> None:
         super()._place(copies, options)
         self._outdated[copies] = True
 

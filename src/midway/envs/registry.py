@@ -3,7 +3,7 @@
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium
 
@@ -37,11 +37,11 @@ class Declaration:
     description: str
     tasks: tuple[str, ...]
     entry_point: str
-    arguments: dict[str, Any] = field(default_factory=dict, hash=False)
+    arguments: dict[str, str] = field(default_factory=dict, hash=False)
     view: View | None = None
     steps: int = 32_000
 
-    def factory(self, **options: Any) -> "GoalVectorEnv":
+    def factory(self, **options: int | str) -> "GoalVectorEnv":
         """Return the vector environment with ``num_envs``, ``task`` and ``num_threads``."""
         module, name = self.entry_point.split(":")
         made: Callable[..., GoalVectorEnv] = getattr(importlib.import_module(module), name)

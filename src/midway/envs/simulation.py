@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Mapping
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -10,8 +9,8 @@ from gymnasium import spaces
 from jaxtyping import Int, Shaped
 from mujoco.batch import Batch
 
-from midway.envs.vector import Array, GoalVectorEnv, Observations
-from midway.types import EnvSpec
+from midway.envs.vector import Array, GoalVectorEnv
+from midway.types import EnvSpec, Observations, Options
 
 
 def num_cores() -> int:
@@ -76,7 +75,7 @@ class SimulationVectorEnv(GoalVectorEnv):
             if name.startswith("desired_")
         }
 
-    def _place(self, copies: Int[Array, " n"], options: Mapping[str, Any]) -> None:
+    def _place(self, copies: Int[Array, " n"], options: Options) -> None:
         """Write start states and goals of these copies, whose simulations are at their default."""
         raise NotImplementedError
 
@@ -88,7 +87,7 @@ class SimulationVectorEnv(GoalVectorEnv):
         """Write the actions to the simulations; MuJoCo clips them to the controls' range."""
         self._ctrl[:] = actions
 
-    def _begin(self, copies: Int[Array, " n"], options: Mapping[str, Any]) -> None:
+    def _begin(self, copies: Int[Array, " n"], options: Options) -> None:
         self.batch.reset(copies, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         self._place(copies, options)
 

@@ -1,13 +1,16 @@
 """The single environments that Gymnasium makes: batches of one."""
 
-from typing import Any
+from typing import TypeAlias
 
 import gymnasium
 import numpy as np
 
 from midway.envs.registry import make_vec
-from midway.envs.vector import Array, Observations
-from midway.types import ConfigurationError
+from midway.envs.vector import Array
+from midway.types import ConfigurationError, Info, Observations, Options
+
+Scalars: TypeAlias = dict[str, float | int]
+"""Info of one environment."""
 
 
 class SingleGoalEnv(gymnasium.Env[Observations, Array]):
@@ -29,12 +32,12 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
     def __init__(self, name: str, task: str = "uniform") -> None:
         self.vector = make_vec(name, num_envs=1, task=task, num_threads=1)
         self.goal_spec = self.vector.goal_spec
-        self.observation_space: gymnasium.Space[Any] = self.vector.single_observation_space
+        self.observation_space: gymnasium.Space[Observations] = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
+        self, *, seed: int | None = None, options: Options | None = None
+    ) -> tuple[Observations, Scalars]:
         """Start a new episode; options are those of the vector environment.
 
         Raises:
@@ -46,7 +49,7 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
         observations, info = self.vector.reset(options=options)
         return _first(observations), _first_info(info)
 
-    def step(self, action: Array) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Array) -> tuple[Observations, float, bool, bool, Scalars]:
         """Move by one step.
 
         Args:
@@ -67,7 +70,7 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
             _first_info(info),
         )
 
-    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: object) -> Array:
         """Return the reward of goals ``(goal_dim,)`` or ``(n, goal_dim)``; info is not used.
 
         Where goals are images, give ``achieved_state`` and ``desired_state`` in their place.
@@ -77,15 +80,15 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
         """
         return self._outcome(achieved_goal, desired_goal)[0]
 
-    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Any:
+    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: object) -> Array:
         """Return whether the goal is reached; goals and errors as of ``compute_reward``."""
         return self._outcome(achieved_goal, desired_goal)[1]
 
-    def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> bool:
+    def compute_truncated(self, achieved_goal: Array, desired_goal: Array, info: Scalars) -> bool:
         """Return whether ``info`` is of the last step that an episode may have."""
         return bool(info["elapsed_steps"] >= self.goal_spec.max_episode_steps)
 
-    def _outcome(self, achieved: Array, desired: Array) -> tuple[Any, Any]:
+    def _outcome(self, achieved: Array, desired: Array) -> tuple[Array, Array]:
         shape = self.goal_spec.state_shape
         if shape is not None and np.shape(achieved)[-1:] + np.shape(desired)[-1:] != shape * 2:
             raise ConfigurationError(
@@ -99,5 +102,5 @@ def _first(observations: Observations) -> Observations:
     return {name: batch[0] for name, batch in observations.items()}
 
 
-def _first_info(info: dict[str, Any]) -> dict[str, Any]:
+def _first_info(info: Info) -> Scalars:
     return {name: batch[0].item() for name, batch in info.items() if not name.startswith("_")}

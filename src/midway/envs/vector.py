@@ -1,7 +1,7 @@
 """The vector environment with goals: everything but the simulation itself."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
@@ -11,11 +11,18 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Int, Shaped, UInt64
 
-from midway.types import ConfigurationError, DistanceTask, EnvSpec
+from midway.types import (
+    ConfigurationError,
+    DistanceTask,
+    EnvSpec,
+    Info,
+    NumPyArray,
+    Options,
+    Step,
+)
+from midway.types import Observations as Observations
 
-Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
-Observations: TypeAlias = dict[str, Array]
-Step: TypeAlias = tuple[Observations, Array, Array, Array, dict[str, Any]]
+Array: TypeAlias = NumPyArray
 
 
 class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
@@ -66,7 +73,7 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
         self.num_envs = num_envs
         self.tasks = tasks
         self.task = self._checked_task(task)
-        boxes: dict[str, spaces.Space[Any]] = {"observation": observation_box}
+        boxes: dict[str, spaces.Space[Array]] = {"observation": observation_box}
         boxes |= {"achieved_goal": goal_box, "desired_goal": goal_box}
         if state_box is not None:
             boxes |= {"achieved_state": state_box, "desired_state": state_box}
@@ -78,7 +85,7 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
         self._elapsed = np.zeros(num_envs, np.int64)
         self._ended = np.ones(num_envs, np.bool_)
 
-    def _begin(self, copies: Int[Array, " n"], options: Mapping[str, Any]) -> None:
+    def _begin(self, copies: Int[Array, " n"], options: Options) -> None:
         """Start a new episode of the current task in these copies."""
         raise NotImplementedError
 
@@ -94,8 +101,8 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        options: Mapping[str, Any] | None = None,
-    ) -> tuple[Observations, dict[str, Any]]:
+        options: Options | None = None,
+    ) -> tuple[Observations, Info]:
         """Start new episodes.
 
         Args:
@@ -207,7 +214,7 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
 
     def _info(
         self, achieved: Array, desired: Array, reached: Array, mask: Bool[Array, " num_envs"]
-    ) -> dict[str, Any]:
+    ) -> Info:
         """Return info in Gymnasium's form: a value per copy and, as ``_name``, who has it."""
         info = {
             "distance": self.goal_spec.task.distance(achieved, desired).astype(np.float64),
@@ -232,7 +239,7 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
             )
         return task
 
-    def _checked_mask(self, mask: Any) -> Bool[Array, " num_envs"]:
+    def _checked_mask(self, mask: object) -> Bool[Array, " num_envs"]:
         """Return the mask, or everyone for None; the checks are those of Gymnasium."""
         if mask is None:
             return np.ones(self.num_envs, np.bool_)
@@ -258,7 +265,7 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
 
 def _generator_row(rng: np.random.Generator) -> UInt64[Array, "6"]:
     """Return the state of a PCG64 generator as six words."""
-    state: Any = rng.bit_generator.state
+    state = rng.bit_generator.state
     words = [state["state"][key] >> shift for key in ("state", "inc") for shift in (64, 0)]
     words += [state["has_uint32"], state["uinteger"]]
     return np.array([word & (2**64 - 1) for word in words], np.uint64)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -232,10 +232,24 @@ def encode_batch(
     return encoder.augment(batch.observation, keys[0]), encoded
 
 
+@runtime_checkable
+class Sees(Protocol):
+    """An agent's state with an encoder of its own."""
+
+    @property
+    def encoder(self) -> Encoder:
+        """The encoder."""
+
+
 def on_observations(function: Callable[..., T]) -> Callable[..., T]:
     """Return a function of (state, features, features) as one of what the environment shows."""
 
-    def read(state: Any, observation: Any, goal: Any, *others: Any) -> T:
+    def read(
+        state: Sees,
+        observation: Shaped[Array, "B ..."],
+        goal: Shaped[Array, "B ..."],
+        *others: object,
+    ) -> T:
         return function(state, state.encoder(observation), state.encoder(goal), *others)
 
     return read

@@ -31,16 +31,16 @@ def minimise(
     network: Network,
     state: optax.OptState,
     learning_rate: float,
-    *inputs: Any,
+    *inputs: object,
 ) -> tuple[Network, optax.OptState, Others]:
     """Return the network after one step of Adam, Adam's new state, and what else the loss gives."""
-    gradient_of: Callable[..., Any] = eqx.filter_value_and_grad(loss, has_aux=True)
+    gradient_of = eqx.filter_value_and_grad(loss, has_aux=True)
     (_, others), gradient = gradient_of(network, *inputs)
     return *step(network, gradient, state, learning_rate), others
 
 
 def step_critic_and_encoder(
-    loss: Callable[..., tuple[Array, Others]], state: State, *inputs: Any
+    loss: Callable[..., tuple[Array, Others]], state: State, *inputs: object
 ) -> tuple[State, Others]:
     """Return the agent's state after one step of critics and encoder, and what else the loss gives.
 
@@ -50,7 +50,7 @@ def step_critic_and_encoder(
         inputs: Of the loss.
     """
     agent: Any = state
-    gradient_of: Callable[..., Any] = eqx.filter_value_and_grad(loss, has_aux=True)
+    gradient_of = eqx.filter_value_and_grad(loss, has_aux=True)
     (_, others), gradients = gradient_of((agent.critic, agent.encoder), *inputs)
     rates = agent.config
     critic = step(agent.critic, gradients[0], agent.critic_optimizer, rates.critic_learning_rate)

@@ -4,12 +4,9 @@ All run on the learner's device inside compiled steps. Donate the replay to a co
 ``add``, and the ring is written in place.
 """
 
-from collections.abc import Mapping
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from midway.replay.relabel import FAR, Rows, draw, goal_rows, rows_between, source_counts
 from midway.replay.storage import (
@@ -23,6 +20,7 @@ from midway.replay.storage import (
     write,
 )
 from midway.types import (
+    AnyArray,
     Batch,
     ConfigurationError,
     EnvSpec,
@@ -49,7 +47,7 @@ def create(spec: EnvSpec, capacity: int, num_lanes: int) -> ReplayState:
     return allocate(_row_kinds(spec), num_lanes, capacity // num_lanes)
 
 
-def begin(replay: ReplayState, observation: Observation, mask: Bool[Any, " K"]) -> ReplayState:
+def begin(replay: ReplayState, observation: Observation, mask: Bool[AnyArray, " K"]) -> ReplayState:
     """Start an episode in each masked lane from the observation ``(K, ...)`` of its reset.
 
     Writes the goal row and the row of s_0. An episode in which no step was taken is overwritten.
@@ -76,9 +74,9 @@ def begin(replay: ReplayState, observation: Observation, mask: Bool[Any, " K"]) 
 
 def add(
     replay: ReplayState,
-    action: Float[Any, "K action_dim"],
+    action: Float[AnyArray, "K action_dim"],
     observation: Observation,
-    mask: Bool[Any, " K"],
+    mask: Bool[AnyArray, " K"],
 ) -> ReplayState:
     """Append one step to the running episode of each masked lane.
 
@@ -119,9 +117,10 @@ def sample(
     goals = "observation" if spec.goal_is_observation else "achieved_goal"
     truth = goals if spec.state_shape is None else "achieved_state"
 
-    def is_reached(lane: Any, position: Any, desired: Any) -> Bool[Array, " B"]:
-        reached: Bool[Array, " B"] = spec.task(read(replay, truth, lane, position), desired)[1]
-        return reached
+    def is_reached(
+        lane: Int[Array, " B"], position: Int[Array, " B"], desired: Shaped[Array, "B ..."]
+    ) -> Bool[Array, " B"]:
+        return spec.task(read(replay, truth, lane, position), desired)[1]
 
     current, candidate = (pairs.lane, pairs.position), (others.lane, others.position)
     goal, ahead = goal_rows(pairs, states, mix, goal_key)
@@ -199,12 +198,12 @@ def _row_kinds(spec: EnvSpec) -> dict[str, tuple[tuple[int, ...], str]]:
     return kinds
 
 
-def _state_row(replay: ReplayState, observation: Observation) -> Mapping[str, Any]:
+def _state_row(replay: ReplayState, observation: Observation) -> Observation:
     """Return the parts of an observation that the row of a state holds."""
     return {name: observation[name] for name in replay.rows if name != "action"}
 
 
-def _goal_row(replay: ReplayState, observation: Observation) -> Mapping[str, Any]:
+def _goal_row(replay: ReplayState, observation: Observation) -> Observation:
     """Return the parts of an observation that the goal row holds, where a state holds its own."""
     goals = "achieved_goal" if "achieved_goal" in replay.rows else "observation"
     row = {goals: observation["desired_goal"]}

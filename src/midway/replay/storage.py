@@ -7,11 +7,13 @@ written; the row at a position lies in slot ``position % L``, until position + L
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, Shaped
+from jaxtyping import Array, Bool, Int, PyTree, Shaped
+
+from midway.types import AnyArray
 
 
 class ReplayState(NamedTuple):
@@ -78,7 +80,7 @@ def allocate(
 def insert(
     array: Shaped[Array, "K L ..."],
     index: Int[Array, " K"],
-    values: Any,
+    values: AnyArray,
     mask: Bool[Array, " K"],
 ) -> Shaped[Array, "K L ..."]:
     """Write ``values`` ``(K, ...)`` at ``index`` modulo L of the masked lanes."""
@@ -92,7 +94,7 @@ def insert(
 def write(
     replay: ReplayState,
     position: Int[Array, " K"],
-    values: Mapping[str, Any],
+    values: Mapping[str, AnyArray],
     mask: Bool[Array, " K"],
 ) -> ReplayState:
     """Write the named values ``(K, ...)`` into the rows at ``position`` of the masked lanes."""
@@ -150,6 +152,6 @@ def bounds(
     return episode_first(replay, lane, serial), episode_end(replay, lane, serial) - 1
 
 
-def num_bytes(replay: Any) -> int:
+def num_bytes(replay: PyTree) -> int:
     """Return the size of all arrays (or of their shapes) in bytes."""
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(replay))

@@ -14,12 +14,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from midway.agents import registry
 from midway.settings import changed
 from midway.training.config import TrainConfig
-from midway.types import ConfigurationError
+from midway.types import ConfigurationError, Hyperparameters, JsonObject
 
 FORMAT = 2
 """Counted up when the files of a run change; format 1 is still understood."""
@@ -45,14 +44,14 @@ class RunConfig:
     preset: str
     seed: int
     train: TrainConfig
-    hyperparameters: Any
+    hyperparameters: Hyperparameters
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return plain values."""
         return dataclasses.asdict(self)
 
     @staticmethod
-    def from_json(values: dict[str, Any]) -> "RunConfig":
+    def from_json(values: JsonObject) -> "RunConfig":
         """Return the configuration of ``to_json``.
 
         Raises:
@@ -73,7 +72,7 @@ class RunConfig:
             raise ConfigurationError(f"configuration not understood: {error}") from error
 
 
-def _of_this_format(values: dict[str, Any]) -> dict[str, Any]:
+def _of_this_format(values: JsonObject) -> JsonObject:
     """Return the values with the names that they have in this format."""
     if values.get("format") != 1:
         return values
@@ -198,7 +197,7 @@ class RunFolder:
         return RunConfig.from_json(values)
 
 
-def provenance() -> dict[str, Any]:
+def provenance() -> JsonObject:
     """Return format, versions, commit, machine and command."""
     return {
         "format": FORMAT,
@@ -226,14 +225,14 @@ def _commit() -> str | None:
     return answer.stdout.strip() if answer.returncode == 0 else None
 
 
-def write_json(path: Path, values: Any) -> None:
+def write_json(path: Path, values: JsonObject) -> None:
     """Write a file that is there whole or not at all."""
     temporary = path.with_name(path.name + ".new")
     temporary.write_text(json.dumps(values, indent=2) + "\n")
     temporary.replace(path)
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> JsonObject:
     """Return the object in a JSON file.
 
     Raises:

@@ -1,26 +1,29 @@
 """Saved policies: weights and a description that others can load."""
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Array, Float, Key, PyTree
 
-from midway.agent import AnyAgent, Encoder, SubgoalDistribution
+from midway.agent import AgentState, AnyAgent, Encoder, Inputs, Memory, SubgoalDistribution
 from midway.agents import registry
 from midway.runs.folder import FORMAT, RunConfig, RunFolder, read_json, write_json
 from midway.training import acting, freeze
+from midway.training.acting import Seen
 from midway.training.arrays import array_names, load_arrays, networks_of, save_arrays
 from midway.training.evaluate import ActionKind
 from midway.training.state import FROZEN, Training
 from midway.training.step import create_state
-from midway.types import EnvSpec
+from midway.types import AnyArray, EnvSpec, NumPyArray
 
-Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
@@ -37,13 +40,13 @@ class Policy:
     """
 
     agent: AnyAgent
-    state: Any
+    state: AgentState
     config: RunConfig
     spec: EnvSpec
     step: int | None = None
     encoder: Encoder | None = None
 
-    def __call__(self, observation: Any, goal: Any) -> Array:
+    def __call__(self, observation: AnyArray, goal: AnyArray) -> NumPyArray:
         """Return the deterministic action, ``(action_dim,)`` or ``(B, action_dim)``.
 
         Args:
@@ -57,7 +60,7 @@ class Policy:
         actions = self._act(observation, goal, jax.random.key(0), explore=False)
         return actions[0] if single else actions
 
-    def sample(self, observation: Any, goal: Any, key: Any) -> Array:
+    def sample(self, observation: Seen, goal: Seen, key: Key[Array, ""]) -> NumPyArray:
         """Return sampled actions ``(B, action_dim)`` for batches."""
         return self._act(observation, goal, key, explore=True)
 
@@ -76,40 +79,45 @@ class Policy:
         begin = partial(acting.begin, self.agent, self.config.hyperparameters, self.state.spec)
         return acting.Actor(self.agent, act, begin, jax.random.key(seed))
 
-    def features(self, observation: Any) -> Array:
+    def features(self, observation: Seen) -> NumPyArray:
         """Return what the networks' state reads of observations or goals ``(B, ...)``."""
         return np.asarray(_features(self.encoder, observation))
 
-    def value(self, observation: Any, goal: Any) -> Array:
+    def value(self, observation: Seen, goal: Seen) -> NumPyArray:
         """Return the agent's value of each pair ``(B,)``; it must have one."""
         assert self.agent.value is not None
         estimate = self.agent.value.estimate
         return np.asarray(_on_features(estimate, self.encoder, self.state, observation, goal))
 
-    def subgoals(self, observation: Any, goal: Any) -> SubgoalDistribution:
+    def subgoals(self, observation: Seen, goal: Seen) -> SubgoalDistribution:
         """Return the subgoals imagined for each pair ``(B, ...)``; the agent must imagine any."""
         found = _on_features(self.agent.subgoals, self.encoder, self.state, observation, goal)
         in_numpy: SubgoalDistribution = jax.tree.map(np.asarray, found)
         return in_numpy
 
-    def _act(self, observation: Any, goal: Any, key: Any, explore: bool) -> Array:
+    def _act(self, observation: Seen, goal: Seen, key: Key[Array, ""], explore: bool) -> NumPyArray:
         pair = (observation, goal, key, explore)
         return np.asarray(_on_features(self.agent.act, self.encoder, self.state, *pair))
 
 
-def _features(encoder: Encoder | None, observation: Any) -> Any:
+def _features(encoder: Encoder | None, observation: Seen) -> AnyArray:
     return observation if encoder is None else _encoded(encoder, observation)
 
 
 @eqx.filter_jit
-def _encoded(encoder: Any, observation: Any) -> Any:
+def _encoded(encoder: Encoder, observation: Inputs) -> Float[Array, "B F"]:
     return encoder(observation)
 
 
 @eqx.filter_jit
 def _on_features(
-    function: Any, encoder: Any, state: Any, observation: Any, goal: Any, *others: Any
-) -> Any:
+    function: Callable[..., Found],
+    encoder: Encoder | None,
+    state: AgentState,
+    observation: Inputs,
+    goal: Inputs,
+    *others: object,
+) -> Found:
     pair = (observation, goal) if encoder is None else (encoder(observation), encoder(goal))
     return function(state, *pair, *others)
 
@@ -117,15 +125,15 @@ def _on_features(
 @eqx.filter_jit
 def _act_on(
     agent: AnyAgent,
-    encoder: Any,
-    state: Any,
-    memory: Any,
-    observation: Any,
-    goal: Any,
-    key: Any,
+    encoder: Encoder | None,
+    state: AgentState,
+    memory: Memory,
+    observation: Inputs,
+    goal: Inputs,
+    key: Key[Array, ""],
     *,
     explore: bool,
-) -> Any:
+) -> tuple[Float[Array, "B A"], Memory]:
     pair = (observation, goal) if encoder is None else (encoder(observation), encoder(goal))
     return acting.act(agent, state, memory, *pair, key, explore=explore)
 
@@ -154,7 +162,7 @@ def _save_weights(path: Path, training: Training) -> None:
     save_arrays(path, networks | _frozen(training.encoder))
 
 
-def _frozen(encoder: Encoder | None) -> dict[str, Any]:
+def _frozen(encoder: Encoder | None) -> dict[str, PyTree]:
     """Return the arrays of a frozen encoder by their name in files; nothing without one."""
     return {} if encoder is None else {FROZEN: eqx.filter(encoder, eqx.is_array)}
 

@@ -4,31 +4,33 @@ The memory of an agent that remembers nothing is an empty tree, which costs noth
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Key, Shaped
 
-from midway.agent import AnyAgent, Memory
-from midway.types import EnvSpec
+from midway.agent import AgentState, AnyAgent, Inputs, Memory
+from midway.types import AnyArray, EnvSpec, Hyperparameters, NumPyArray
 
-Act = Callable[[Memory, Any, Any, Key[Array, ""]], tuple[Float[Array, "B action_dim"], Memory]]
+Seen = Shaped[AnyArray, "B ..."]
+"""Observations or goals, on their way to a compiled function."""
+
+Act = Callable[[Memory, Seen, Seen, Key[Array, ""]], tuple[Float[Array, "B action_dim"], Memory]]
 """``(memory, observation, goal, key) -> (actions, memory)``."""
 
 
-def begin(agent: AnyAgent, config: Any, spec: EnvSpec, num_episodes: int) -> Memory:
+def begin(agent: AnyAgent, config: Hyperparameters, spec: EnvSpec, num_episodes: int) -> Memory:
     """Return what the agent remembers before the first step of each episode."""
     return agent.memory.begin(config, spec, num_episodes) if agent.memory else ()
 
 
 def act(
     agent: AnyAgent,
-    state: Any,
+    state: AgentState,
     memory: Memory,
-    observation: Any,
-    goal: Any,
+    observation: Inputs,
+    goal: Inputs,
     key: Key[Array, ""],
     *,
     explore: bool,
@@ -39,7 +41,7 @@ def act(
     return agent.act(state, observation, goal, key, explore), memory
 
 
-def renew(memory: Memory, fresh: Memory, begun: Bool[Any, " B"]) -> Memory:
+def renew(memory: Memory, fresh: Memory, begun: Bool[AnyArray, " B"]) -> Memory:
     """Return the memory with its rows of newly begun episodes taken from ``fresh``."""
 
     def choose(new: Array, old: Array) -> Array:
@@ -70,7 +72,7 @@ class Actor:
         self._calls = 0
         self.memory: Memory = None
 
-    def __call__(self, observation: Any, goal: Any) -> np.ndarray[Any, np.dtype[Any]]:
+    def __call__(self, observation: Seen, goal: Seen) -> NumPyArray:
         """Return actions ``(B, action_dim)`` for one step of every environment."""
         if self._calls == 0:
             self.memory = self._begin(len(observation))
@@ -79,7 +81,7 @@ class Actor:
         actions, self.memory = self._act(self.memory, observation, goal, key)
         return np.asarray(actions)
 
-    def rest(self, done: Bool[Any, " B"]) -> None:
+    def rest(self, done: Bool[AnyArray, " B"]) -> None:
         """Compute nothing more than needed for these episodes, which are over."""
         if self._rest is not None:
             self.memory = self._rest(self.memory, done)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -11,18 +11,19 @@ from jaxtyping import PyTree
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
-from midway.types import ConfigurationError
+from midway.agent import AgentState
+from midway.types import AnyArray, ConfigurationError
 
 Tree = TypeVar("Tree", bound=PyTree)
 
 
-def named_arrays(tree: PyTree) -> dict[str, Any]:
+def named_arrays(tree: PyTree) -> dict[str, AnyArray]:
     """Return the tree's leaves by their paths, such as ``policy.network.layers.0.weight``."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
-def with_named_arrays(tree: Tree, arrays: Mapping[str, Any]) -> Tree:
+def with_named_arrays(tree: Tree, arrays: Mapping[str, AnyArray]) -> Tree:
     """Return the tree with its leaves replaced by those of the same name.
 
     Raises:
@@ -43,7 +44,7 @@ def with_named_arrays(tree: Tree, arrays: Mapping[str, Any]) -> Tree:
     return tree
 
 
-def networks_of(state: Any, names: tuple[str, ...]) -> dict[str, Any]:
+def networks_of(state: AgentState, names: tuple[str, ...]) -> dict[str, PyTree]:
     """Return the arrays of some parts of an agent's state, by part."""
     return {name: eqx.filter(getattr(state, name), eqx.is_array) for name in names}
 

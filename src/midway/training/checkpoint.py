@@ -1,13 +1,16 @@
 """Whole states on disk: written completely or not at all."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from midway.types import ConfigurationError
+from midway.types import AnyArray, ConfigurationError, NumPyArray
+
+Stored: TypeAlias = dict[str, Any]
+"""Dictionaries of arrays, within each other."""
 
 KEPT = 2
 """Checkpoints kept: the newest, and the one before it should the newest be damaged."""
@@ -28,7 +31,7 @@ class Checkpoints:
             folder.absolute(), options=options, item_handlers=ocp.StandardCheckpointHandler()
         )
 
-    def save(self, step: int, state: Any) -> None:
+    def save(self, step: int, state: Stored) -> None:
         """Write a state, a nested dictionary of arrays, unless that of this step is there.
 
         Raises:
@@ -52,7 +55,7 @@ class Checkpoints:
         """Return the names of what a checkpoint holds; nothing if it cannot be read."""
         return tuple(self._manager.item_metadata(step) or {})
 
-    def restore(self, step: int, like: Any) -> Any:
+    def restore(self, step: int, like: Stored) -> Stored:
         """Return the state of a step, with the structure, shapes and dtypes of ``like``.
 
         Raises:
@@ -60,14 +63,15 @@ class Checkpoints:
         """
         try:
             target = jax.tree.map(_abstract, self._stored(step, like))
-            return self._manager.restore(step, args=ocp.args.StandardRestore(target))
+            restored: Stored = self._manager.restore(step, args=ocp.args.StandardRestore(target))
+            return restored
         except (ValueError, KeyError, FileNotFoundError) as error:
             reason = str(error).splitlines()[0]
             raise ConfigurationError(
                 f"checkpoint of step {step} cannot be read: {reason}"
             ) from error
 
-    def _stored(self, step: int, like: Any) -> Any:
+    def _stored(self, step: int, like: Stored) -> Stored:
         """Return ``like`` without the sums that checkpoints of earlier versions do not have."""
         stored = self._manager.item_metadata(step) or {}
         if "logged" in stored.get("collector", {}):
@@ -80,7 +84,7 @@ class Checkpoints:
         self._manager.close()
 
 
-def _abstract(leaf: Any) -> Any:
+def _abstract(leaf: AnyArray) -> jax.ShapeDtypeStruct | NumPyArray:
     """Describe an array: NumPy arrays come back as NumPy arrays, others on their devices."""
     if isinstance(leaf, jax.Array):
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)

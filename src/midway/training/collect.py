@@ -3,15 +3,15 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from midway.replay.storage import ReplayState
 from midway.training import step
-from midway.types import ConfigurationError
+from midway.training.checkpoint import Stored
+from midway.types import ConfigurationError, NumPyArray, Observations, VectorGoalEnv
 
-Actions = Callable[[dict[str, Any]], np.ndarray[Any, np.dtype[np.float32]]]
+Actions = Callable[[Observations], NumPyArray]
 
 
 @dataclass
@@ -47,19 +47,21 @@ class Collector:
             logged, by its name in ``metrics.csv``.
     """
 
-    env: Any
-    observation: dict[str, Any]
-    begun: np.ndarray[Any, np.dtype[np.bool_]]
+    env: VectorGoalEnv
+    observation: Observations
+    begun: NumPyArray
     counts: EpisodeCounts = field(default_factory=EpisodeCounts)
     limit: int = 0
-    logged: dict[str, np.ndarray[Any, np.dtype[np.float64]]] = field(default_factory=dict)
+    logged: dict[str, NumPyArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Begin the sums that are not given."""
         self.logged = {name: np.zeros(2) for name in self.env.logged_info.values()} | self.logged
 
     @staticmethod
-    def start(env: Any, replay: ReplayState, seed: int) -> tuple["Collector", ReplayState]:
+    def start(
+        env: VectorGoalEnv, replay: ReplayState, seed: int
+    ) -> tuple["Collector", ReplayState]:
         """Reset every environment and begin its first episode in the replay."""
         observation, _ = env.reset(seed=seed)
         everyone = np.ones(env.num_envs, np.bool_)
@@ -96,7 +98,7 @@ class Collector:
         self.logged = {column: np.zeros(2) for column in self.logged}
         return metrics
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> Stored:
         """Return simulators, observations and counts as arrays."""
         return {
             **({"logged": {k: v.copy() for k, v in self.logged.items()}} if self.logged else {}),
@@ -107,7 +109,7 @@ class Collector:
 
     @staticmethod
     def restore(
-        env: Any, replay: ReplayState, state: dict[str, Any]
+        env: VectorGoalEnv, replay: ReplayState, state: Stored
     ) -> tuple["Collector", ReplayState]:
         """Return the collector that ``state_dict`` was taken from, on a new environment.
 

@@ -7,7 +7,7 @@ to rounding, the same numbers on any number of devices. On one device nothing he
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, TypeVar
+from typing import ParamSpec, TypeVar
 
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
@@ -16,6 +16,8 @@ from jaxtyping import PyTree
 from midway.types import ConfigurationError
 
 Tree = TypeVar("Tree", bound=PyTree)
+Inputs = ParamSpec("Inputs")
+Result = TypeVar("Result")
 
 AXIS = "devices"
 SPLIT = PartitionSpec(AXIS)
@@ -78,11 +80,14 @@ class Devices:
         new: Tree = jax.jit(create, out_shardings=NamedSharding(self.mesh, SPLIT))()
         return new
 
-    def compile(self, function: Callable[..., Any], **options: Any) -> Any:
+    def compile(
+        self, function: Callable[Inputs, Result], donate_argnums: tuple[int, ...] = ()
+    ) -> Callable[Inputs, Result]:
         """Return the compiled function, whose results are whole on every device."""
-        if self.mesh is not None:
-            options["out_shardings"] = NamedSharding(self.mesh, PartitionSpec())
-        return jax.jit(function, **options)
+        if self.mesh is None:
+            return jax.jit(function, donate_argnums=donate_argnums)
+        whole = NamedSharding(self.mesh, PartitionSpec())
+        return jax.jit(function, donate_argnums=donate_argnums, out_shardings=whole)
 
     def _put(self, tree: Tree, spec: PartitionSpec) -> Tree:
         if self.mesh is None:
@@ -92,8 +97,8 @@ class Devices:
 
 
 def compile_by_lane(
-    function: Callable[..., Any], donated: tuple[int, ...] = (0,)
-) -> Callable[..., Any]:
+    function: Callable[Inputs, Result], donated: tuple[int, ...] = (0,)
+) -> Callable[Inputs, Result]:
     """Compile a function of a tree ``(K, ...)`` and of values ``(K, ...)`` that keeps lanes apart.
 
     The tree is donated, unless told otherwise. Where it is split over devices, each device does its
@@ -102,13 +107,13 @@ def compile_by_lane(
     on_one_device = jax.jit(function, donate_argnums=donated)
 
     @cache
-    def on(mesh: Mesh) -> Callable[..., Any]:
+    def on(mesh: Mesh) -> Callable[Inputs, Result]:
         by_device = jax.shard_map(function, mesh=mesh, in_specs=SPLIT, out_specs=SPLIT)
         return jax.jit(by_device, donate_argnums=donated)
 
-    def run(tree: PyTree, *values: Any) -> Any:
-        sharding = jax.tree.leaves(tree)[0].sharding
+    def run(*inputs: Inputs.args, **options: Inputs.kwargs) -> Result:
+        sharding = jax.tree.leaves(inputs[0])[0].sharding
         compiled = on(sharding.mesh) if isinstance(sharding, NamedSharding) else on_one_device
-        return compiled(tree, *values)
+        return compiled(*inputs, **options)
 
     return run

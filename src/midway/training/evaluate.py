@@ -2,15 +2,15 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-ActionKind: TypeAlias = Literal["mean", "sampled"]
-Policy: TypeAlias = Callable[[Any, Any], Any]
-"""``(observation, goal) -> action`` over a batch."""
+from midway.types import AnyArray, Info, NumPyArray, Observations, VectorGoalEnv
 
-Mask: TypeAlias = np.ndarray[Any, np.dtype[np.bool_]]
+ActionKind: TypeAlias = Literal["mean", "sampled"]
+Policy: TypeAlias = Callable[[NumPyArray, NumPyArray], AnyArray]
+"""``(observation, goal) -> action`` over a batch."""
 
 PREFIX = "distance_"
 """Info of this beginning is a distance with a name."""
@@ -78,14 +78,14 @@ class Moment(NamedTuple):
         success: Whether the goal was reached ``(K,)``.
     """
 
-    observation: dict[str, Any]
-    info: Mapping[str, Any]
-    running: Mask
-    ended: Mask
-    success: Mask
+    observation: Observations
+    info: Info
+    running: NumPyArray
+    ended: NumPyArray
+    success: NumPyArray
 
 
-def rollout(env: Any, actor: Policy, observation: dict[str, Any]) -> Iterator[Moment]:
+def rollout(env: VectorGoalEnv, actor: Policy, observation: Observations) -> Iterator[Moment]:
     """Yield the steps of one episode in each environment, until the last one has ended.
 
     An environment that is done goes round again, unrecorded, and the actor rests there.
@@ -108,7 +108,9 @@ def rollout(env: Any, actor: Policy, observation: dict[str, Any]) -> Iterator[Mo
             rest(~running)
 
 
-def run_episodes(env: Any, policy: Policy, task: str, actions: ActionKind, seed: int) -> Evaluation:
+def run_episodes(
+    env: VectorGoalEnv, policy: Policy, task: str, actions: ActionKind, seed: int
+) -> Evaluation:
     """Run one episode in each environment.
 
     Args:
@@ -131,7 +133,7 @@ def run_episodes(env: Any, policy: Policy, task: str, actions: ActionKind, seed:
     return Evaluation(task, actions, tuple(episodes[number] for number in range(env.num_envs)))
 
 
-def _named_distances(info: Mapping[str, Any], number: int) -> dict[str, float]:
+def _named_distances(info: Info, number: int) -> dict[str, float]:
     """Return the named distances of one environment: ``distance_hand`` as ``hand``."""
     return {
         name.removeprefix(PREFIX): float(values[number])

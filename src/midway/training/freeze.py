@@ -14,14 +14,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Array, Float, UInt8
 
-from midway.agent import AnyAgent, Encoder
+from midway.agent import AgentState, AnyAgent, Encoder
 from midway.replay.storage import ReplayState
 from midway.training.devices import compile_by_lane
-from midway.types import EnvSpec
+from midway.types import EnvSpec, Info, NumPyArray, Observations, Options, Step, VectorGoalEnv
 
-Encode = Callable[[UInt8[Any, "B H W 3"]], Float[Any, "B F"]]
+Encode = Callable[[UInt8[NumPyArray, "B H W 3"]], Float[Array, "B F"]]
 
 
 def encoded_spec(spec: EnvSpec, encoder: Encoder) -> EnvSpec:
@@ -38,7 +38,7 @@ def encoded_replay(replay: ReplayState, encoder: Encoder) -> ReplayState:
     return replay._replace(rows={**replay.rows, "observation": features})
 
 
-def keep(agent: AnyAgent, fresh: Any, state: Any) -> Any:
+def keep(agent: AnyAgent, fresh: AgentState, state: AgentState) -> AgentState:
     """Return the agent created for the features with what it takes over from that of images."""
     kept = agent.freezing.kept if agent.freezing else ()
     return replace(fresh, **{name: getattr(state, name) for name in kept})
@@ -53,7 +53,7 @@ class FrozenEnv:
         encode: The encoder, compiled.
     """
 
-    def __init__(self, env: Any, spec: EnvSpec, encode: Encode) -> None:
+    def __init__(self, env: VectorGoalEnv, spec: EnvSpec, encode: Encode) -> None:
         self.env = env
         self._encode = encode
         self.goal_spec = spec
@@ -62,17 +62,19 @@ class FrozenEnv:
         """Return what is not an observation from the environment."""
         return getattr(self.env, name)
 
-    def reset(self, **options: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: Options | None = None
+    ) -> tuple[Observations, Info]:
         """Reset the environment."""
-        observation, info = self.env.reset(**options)
+        observation, info = self.env.reset(seed=seed, options=options)
         return self.see(observation), info
 
-    def step(self, actions: Any) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
+    def step(self, actions: NumPyArray) -> Step:
         """Take a step in every environment."""
-        observation, *outcome = self.env.step(actions)
-        return self.see(observation), *outcome
+        observation, reward, terminated, truncated, info = self.env.step(actions)
+        return self.see(observation), reward, terminated, truncated, info
 
-    def see(self, observation: dict[str, Any]) -> dict[str, Any]:
+    def see(self, observation: Observations) -> Observations:
         """Return the observation with features; what is seen is also what is achieved."""
         pair = np.concatenate([observation["observation"], observation["desired_goal"]])
         seen, goal = np.split(np.asarray(self._encode(pair)), 2)

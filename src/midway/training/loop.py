@@ -10,7 +10,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, Protocol, TypeAlias
+from types import FrameType
+from typing import Protocol, TypeAlias
 
 import jax
 import numpy as np
@@ -20,7 +21,7 @@ from midway.training.arrays import named_arrays
 from midway.training.compilation import give_back_memory
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.state import Counters, Training, freeze_encoder
-from midway.types import NonFiniteError
+from midway.types import NonFiniteError, NumPyArray, Observations
 
 EVALUATED_TASKS = ("hard", "uniform")
 EVALUATED_ACTIONS: tuple[ActionKind, ...] = ("mean", "sampled")
@@ -76,7 +77,7 @@ def advance(training: Training) -> None:
     training.counters = training.counters._replace(training_seconds=seconds)
 
 
-def _choose(training: Training, observation: dict[str, Any]) -> Any:
+def _choose(training: Training, observation: Observations) -> NumPyArray:
     """Return uniform random actions at first, then sampled actions of the policy."""
     train, streams, steps = training.setup.train, training.streams, training.counters.steps
     if steps < train.random_steps:
@@ -229,7 +230,7 @@ def _interruptible() -> Iterator[threading.Event]:
     names = (signal.SIGINT, signal.SIGTERM)
     previous = {name: signal.getsignal(name) for name in names}
 
-    def handle(number: int, frame: Any) -> None:
+    def handle(number: int, frame: FrameType | None) -> None:
         event.set()
         for name in names:
             signal.signal(name, previous[name])

@@ -8,15 +8,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Key
 
-from midway.agent import Pretrain, PretrainSettings
+from midway.agent import AgentState, Pretrain, PretrainSettings
 from midway.tables import Appender
 from midway.training import seeds
 from midway.training.arrays import load_arrays, networks_of, save_arrays
-from midway.types import NonFiniteError, Subgoal
+from midway.types import NonFiniteError, Observations, Subgoal, VectorGoalEnv
 
-MakeEnv: TypeAlias = Callable[[int, str], Any]
+MakeEnv: TypeAlias = Callable[[int, str], VectorGoalEnv]
 """``(number of environments, task) -> vector environment``."""
 
 Say: TypeAlias = Callable[[str], None]
@@ -30,8 +30,8 @@ MESSAGES = 10
 
 
 def run(
-    ability: AnyPretrain, state: Any, make_env: MakeEnv, seed: int, folder: Path, say: Say
-) -> Any:
+    ability: AnyPretrain, state: AgentState, make_env: MakeEnv, seed: int, folder: Path, say: Say
+) -> AgentState:
     """Return the agent's state after its pre-training.
 
     The networks are written to ``pretrained.safetensors``, the losses to ``pretraining.csv``.
@@ -59,7 +59,7 @@ def run(
     return state
 
 
-def sample_states(env: Any, settings: PretrainSettings, seed: int) -> Subgoal:
+def sample_states(env: VectorGoalEnv, settings: PretrainSettings, seed: int) -> Subgoal:
     """Return states ``(N, ...)``: those of resets, and those after each of a few random actions.
 
     Args:
@@ -68,10 +68,11 @@ def sample_states(env: Any, settings: PretrainSettings, seed: int) -> Subgoal:
         seed: Seed of resets and actions.
     """
     generator = np.random.default_rng(seed)
-    found: list[Any] = [env.reset(seed=seed)[0]]
+    shape = (env.num_envs, env.goal_spec.action_dim)
+    found: list[Observations] = [env.reset(seed=seed)[0]]
     while len(found) * env.num_envs < settings.states:
         for _ in range(settings.random_actions):
-            actions = generator.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+            actions = generator.uniform(-1, 1, shape).astype(np.float32)
             observation, _, terminated, truncated, _ = env.step(actions)
             found.append(observation)
             if (ended := terminated | truncated).any():
@@ -85,8 +86,13 @@ def sample_states(env: Any, settings: PretrainSettings, seed: int) -> Subgoal:
 
 
 def train(
-    ability: AnyPretrain, state: Any, states: Subgoal, key: Any, folder: Path, say: Say
-) -> Any:
+    ability: AnyPretrain,
+    state: AgentState,
+    states: Subgoal,
+    key: Key[Array, ""],
+    folder: Path,
+    say: Say,
+) -> AgentState:
     """Return the agent's state after all rounds; each is one row of ``pretraining.csv``."""
     table = Appender(folder / "pretraining.csv", until=0)
     one_round = eqx.filter_jit(ability.round)
@@ -104,7 +110,7 @@ def train(
     return state
 
 
-def load(state: Any, networks: tuple[str, ...], run: Path) -> Any:
+def load(state: AgentState, networks: tuple[str, ...], run: Path) -> AgentState:
     """Return the agent's state with the pre-trained networks of a run.
 
     Raises:
@@ -112,7 +118,10 @@ def load(state: Any, networks: tuple[str, ...], run: Path) -> Any:
     """
     arrays = load_arrays(_file(run), networks_of(state, networks))
     parts = [eqx.combine(arrays[name], getattr(state, name)) for name in networks]
-    return eqx.tree_at(lambda s: [getattr(s, name) for name in networks], state, parts)
+    loaded: AgentState = eqx.tree_at(
+        lambda s: [getattr(s, name) for name in networks], state, parts
+    )
+    return loaded
 
 
 def _file(run: Path) -> Path:

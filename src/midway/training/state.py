@@ -4,23 +4,23 @@ import time
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
-from midway.agent import AnyAgent, Encoder, Memory
+from midway.agent import AgentState, AnyAgent, Encoder, Memory
 from midway.replay import buffer
 from midway.replay.storage import ReplayState
 from midway.training import acting, freeze, pretrain, seeds, step
 from midway.training.arrays import named_arrays, with_named_arrays
-from midway.training.checkpoint import Checkpoints
+from midway.training.checkpoint import Checkpoints, Stored
 from midway.training.collect import Collector
 from midway.training.config import TrainConfig
 from midway.training.devices import Devices
 from midway.training.pretrain import MakeEnv, Say
 from midway.training.step import Arrays, Program
-from midway.types import EnvSpec, Metrics
+from midway.types import EnvSpec, Hyperparameters, Metrics, VectorGoalEnv
 
 FROZEN = "frozen_encoder"
 """Part of a checkpoint that is there once the encoder is frozen."""
@@ -40,7 +40,7 @@ class Setup:
     """
 
     agent: AnyAgent
-    hyperparameters: Any
+    hyperparameters: Hyperparameters
     train: TrainConfig
     seed: int
     make_env: MakeEnv
@@ -92,10 +92,10 @@ class Training:
     streams: seeds.Streams
     encoder: Encoder | None = None
     counters: Counters = field(default_factory=Counters)
-    evaluation_envs: dict[str, Any] = field(default_factory=dict)
+    evaluation_envs: dict[str, VectorGoalEnv] = field(default_factory=dict)
 
     @property
-    def state(self) -> Any:
+    def state(self) -> AgentState:
         """The agent's state."""
         return self.program.state(self.arrays)
 
@@ -103,8 +103,7 @@ class Training:
     def env_spec(self) -> EnvSpec:
         """What agents may know of the environment itself, images included."""
         env = self.collector.env
-        spec: EnvSpec = (env.env if self.encoder is not None else env).goal_spec
-        return spec
+        return (env.env if isinstance(env, freeze.FrozenEnv) else env).goal_spec
 
     def begin_episodes(self, count: int) -> Memory:
         """Return what the agent remembers at the start of as many episodes."""
@@ -112,7 +111,7 @@ class Training:
         fresh = acting.begin(agent, config, self.program.spec, count)
         return _devices(self.setup).copied(fresh)
 
-    def make_env(self, count: int, task: str) -> Any:
+    def make_env(self, count: int, task: str) -> VectorGoalEnv:
         """Return environments as the agent sees them."""
         return _seen(self.setup, self.setup.make_env(count, task), self.encoder)
 
@@ -143,7 +142,11 @@ def start(setup: Setup, say: Say | None = None) -> Training:
 
 
 def _begin(
-    setup: Setup, env: Any, state: Any, encoder: Encoder | None, counters: Counters
+    setup: Setup,
+    env: VectorGoalEnv,
+    state: AgentState,
+    encoder: Encoder | None,
+    counters: Counters,
 ) -> Training:
     """Return a run with an empty replay and new episodes."""
     train, devices = setup.train, _devices(setup)
@@ -165,13 +168,13 @@ def _devices(setup: Setup) -> Devices:
     return Devices.first(setup.train.devices)
 
 
-def _create(setup: Setup, spec: EnvSpec) -> Any:
+def _create(setup: Setup, spec: EnvSpec) -> AgentState:
     """Return the agent's state at its start."""
     key = _devices(setup).copied(seeds.training(setup.seed)).network_key
     return step.create_state(setup.agent, setup.hyperparameters, spec, key)
 
 
-def _compiled(setup: Setup, state: Any) -> tuple[Program, Arrays]:
+def _compiled(setup: Setup, state: AgentState) -> tuple[Program, Arrays]:
     """Return the agent's compiled functions and its arrays, on the run's devices."""
     devices = _devices(setup)
     arrays, static = eqx.partition(state, eqx.is_array)
@@ -182,7 +185,7 @@ def _spec(spec: EnvSpec, encoder: Encoder | None) -> EnvSpec:
     return spec if encoder is None else freeze.encoded_spec(spec, encoder)
 
 
-def _seen(setup: Setup, env: Any, encoder: Encoder | None) -> Any:
+def _seen(setup: Setup, env: VectorGoalEnv, encoder: Encoder | None) -> VectorGoalEnv:
     """Return an environment as the agent sees it: through the frozen encoder, if there is one."""
     if encoder is None:
         return env
@@ -203,10 +206,11 @@ def freeze_encoder(training: Training) -> None:
     fresh = _create(setup, _spec(training.program.spec, encoder))
     _see_features(training, encoder, freeze.keep(setup.agent, fresh, state))
     training.replay = freeze.encoded_replay(training.replay, encoder)
-    training.collector.observation = training.collector.env.see(training.collector.observation)
+    if isinstance(env := training.collector.env, freeze.FrozenEnv):
+        training.collector.observation = env.see(training.collector.observation)
 
 
-def _see_features(training: Training, encoder: Encoder, state: Any) -> None:
+def _see_features(training: Training, encoder: Encoder, state: AgentState) -> None:
     """Go on with this state of the agent, on environments seen through the frozen encoder."""
     training.encoder = encoder
     training.program, training.arrays = _compiled(training.setup, state)
@@ -217,7 +221,7 @@ def _see_features(training: Training, encoder: Encoder, state: Any) -> None:
 # --- files ----------------------------------------------------------------------------------------
 
 
-def state_dict(training: Training) -> dict[str, Any]:
+def state_dict(training: Training) -> Stored:
     """Return all that the future depends on, as a dictionary of arrays."""
     optional = {
         "memory": named_arrays(training.memory),
@@ -249,7 +253,7 @@ def restore(training: Training, checkpoints: Checkpoints, number: int) -> Traini
     return training
 
 
-def load_state_dict(training: Training, state: dict[str, Any]) -> None:
+def load_state_dict(training: Training, state: Stored) -> None:
     """Continue from a ``state_dict``, bit for bit."""
     if training.encoder is not None:
         weights, static = eqx.partition(training.encoder, eqx.is_array)

@@ -3,20 +3,20 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Float, Int, Key, PyTree
 
-from midway.agent import AnyAgent, Memory
+from midway.agent import AgentState, AnyAgent, Inputs, Memory
 from midway.replay import buffer
 from midway.replay.storage import ReplayState
 from midway.training import acting
 from midway.training.config import TrainConfig
 from midway.training.devices import Devices, compile_by_lane
-from midway.types import EnvSpec, Metrics, Sampling
+from midway.types import EnvSpec, Hyperparameters, Metrics, Sampling
 
 Arrays: TypeAlias = PyTree
 """The arrays of an agent's state; what is static in it is compiled in."""
@@ -34,7 +34,7 @@ class Program:
         act_mean: The same with deterministic actions.
     """
 
-    static: Any
+    static: AgentState
     train: Callable[..., tuple[Arrays, Metrics]]
     act: Callable[..., tuple[Float[Array, "K action_dim"], Memory]]
     act_mean: Callable[..., tuple[Float[Array, "K action_dim"], Memory]]
@@ -42,28 +42,39 @@ class Program:
     @property
     def spec(self) -> EnvSpec:
         """What the networks were made for."""
-        spec: EnvSpec = self.static.spec
-        return spec
+        return self.static.spec
 
-    def state(self, arrays: Arrays) -> Any:
+    def state(self, arrays: Arrays) -> AgentState:
         """Return the agent's state."""
-        return eqx.combine(arrays, self.static)
+        state: AgentState = eqx.combine(arrays, self.static)
+        return state
 
 
-def create_state(agent: AnyAgent, config: Any, spec: EnvSpec, key: Key[Array, ""]) -> Any:
+def create_state(
+    agent: AnyAgent, config: Hyperparameters, spec: EnvSpec, key: Key[Array, ""]
+) -> AgentState:
     """Return the agent's state at its start, made by one compiled program rather than dozens."""
-    return eqx.filter_jit(agent.create)(config, spec, key)
+    state: AgentState = eqx.filter_jit(agent.create)(config, spec, key)
+    return state
 
 
-def compile_program(agent: AnyAgent, static: Any, config: TrainConfig, devices: Devices) -> Program:
+def compile_program(
+    agent: AnyAgent, static: AgentState, config: TrainConfig, devices: Devices
+) -> Program:
     """Return the agent's compiled functions; each is traced once for the run's shapes."""
     spec, size = static.spec, batch_size(config, static.spec)
     wanted = sampling(agent, static)
 
     def train(
-        arrays: Arrays, totals: Metrics, replay: ReplayState, key: Key[Array, ""], updates: Any
+        arrays: Arrays,
+        totals: Metrics,
+        replay: ReplayState,
+        key: Key[Array, ""],
+        updates: Int[Array, ""],
     ) -> tuple[Arrays, Metrics]:
-        def one(carry: tuple[Arrays, Metrics], count: Any) -> tuple[tuple[Arrays, Metrics], None]:
+        def one(
+            carry: tuple[Arrays, Metrics], count: Int[Array, ""]
+        ) -> tuple[tuple[Arrays, Metrics], None]:
             arrays, totals = carry
             sample_key, update_key = jax.random.split(jax.random.fold_in(key, count))
             batch = buffer.sample(replay, spec, config.relabel, size, sample_key, wanted)
@@ -77,9 +88,16 @@ def compile_program(agent: AnyAgent, static: Any, config: TrainConfig, devices: 
         return jax.lax.scan(one, (arrays, totals), counts)[0]
 
     def act(
-        arrays: Arrays, *inputs: Any, explore: bool
+        arrays: Arrays,
+        memory: Memory,
+        observation: Inputs,
+        goal: Inputs,
+        key: Key[Array, ""],
+        *,
+        explore: bool,
     ) -> tuple[Float[Array, "K action_dim"], Memory]:
-        return acting.act(agent, eqx.combine(arrays, static), *inputs, explore=explore)
+        state: AgentState = eqx.combine(arrays, static)
+        return acting.act(agent, state, memory, observation, goal, key, explore=explore)
 
     return Program(
         static=static,
@@ -89,7 +107,7 @@ def compile_program(agent: AnyAgent, static: Any, config: TrainConfig, devices: 
     )
 
 
-def sampling(agent: AnyAgent, static: Any) -> Sampling:
+def sampling(agent: AnyAgent, static: AgentState) -> Sampling:
     """Return what the agent wants of a batch."""
     return agent.sampling(static.config) if agent.sampling else Sampling()
 
