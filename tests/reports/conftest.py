@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from midway.training import api, decoder, policy
-from midway.training.folder import RunFolder
+from midway import api
+from midway.reports import decoder
+from midway.runs import policy
+from midway.runs.folder import RunFolder
 
 TINY = {
     "num_envs": 8,
@@ -92,5 +94,5 @@ def image_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def quick_decoder(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"IMAGES": 40, "COPIES": 5, "UPDATES": 2, "UPDATES_PER_CALL": 2}.items():
+    for name, value in {"IMAGES": 40, "NUM_ENVS": 5, "UPDATES": 2, "UPDATES_PER_CALL": 2}.items():
         monkeypatch.setattr(decoder, name, value)

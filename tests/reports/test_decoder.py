@@ -12,8 +12,10 @@ import pytest
 
 from drawing_here import needs_renderer
 from midway.envs.registry import make_vec
-from midway.training import api, decoder, policy
-from midway.training.folder import RunFolder
+from midway import api
+from midway.reports import decoder
+from midway.runs import policy
+from midway.runs.folder import RunFolder
 
 pytestmark = needs_renderer
 
@@ -32,7 +34,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 @pytest.fixture(autouse=True)
 def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
-    small = {"IMAGES": 60, "COPIES": 5, "UPDATES": 2, "UPDATES_PER_CALL": 2, "BATCH_SIZE": 4}
+    small = {"IMAGES": 60, "NUM_ENVS": 5, "UPDATES": 2, "UPDATES_PER_CALL": 2, "BATCH_SIZE": 4}
     for name, value in small.items():
         monkeypatch.setattr(decoder, name, value)
 
