@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from drawing_here import needs_renderer
+from midway import api
 from midway.cli.main import main
 from midway.envs.registry import make_vec
-from midway import api
 from midway.reports import decoder, images, recordings, report, tabletop, videos, watch
 from midway.reports.recordings import Recording
 from midway.reports.scenes import TableScene, Words
