@@ -53,6 +53,22 @@ def planner(config: leap.Config) -> leap.State:
     return with_plain_latents(leap.create(config, SPECS["states"], KEY))
 
 
+def on_features(config):
+    """Return LEAP as it acts on images: made for the latents of its frozen autoencoder."""
+    pictured = leap.create(config, SPECS["images"], KEY)
+    encoder = leap.AGENT.freezing.encoder(pictured)
+    spec = freeze.encoded_spec(SPECS["images"], encoder)
+    fresh = leap.create(config, spec, KEY)
+    return freeze.keep(leap.AGENT, fresh, pictured), spec, encoder
+
+
+def made(config, kind):
+    """Return LEAP as it acts and learns on a kind of observations, and what it was made for."""
+    if kind == "images":
+        return on_features(config)[:2]
+    return leap.create(config, SPECS[kind], KEY), SPECS[kind]
+
+
 # --- the planner ----------------------------------------------------------------------------------
 
 
@@ -207,9 +223,8 @@ def test_exploration_is_the_tdm_without_a_plan():
 
 @pytest.mark.parametrize("kind", SPECS)
 def test_actions_are_in_bounds_and_repeatable(kind):
-    spec = SPECS[kind]
     config = replace(SMALL, plan_samples=8, plan_iterations=2)
-    state = leap.create(config, spec, KEY)
+    state, spec = made(config, kind)
     observation = jnp.ones((2, *spec.observation_shape), spec.observation_dtype)
     goal = jnp.zeros((2, *spec.goal_shape), spec.observation_dtype)
     act = eqx.filter_jit(leap.act)
@@ -233,7 +248,7 @@ def test_subgoals_have_both_roles():
 
 
 def test_image_subgoals_are_decoded_and_encoded_again():
-    state = leap.create(replace(SMALL, latent_size=6), SPECS["images"], KEY)
+    state, _ = made(replace(SMALL, latent_size=6), "images")
     assert isinstance(state.vae, ImageVAE)
     assert state.policy.layers[0].weight.shape[0] == 6 + 6 + 1
     latent = jax.random.normal(KEY, (3, 6))
@@ -250,7 +265,7 @@ def draw_batch(spec: EnvSpec, size: int) -> Batch:
     rng = np.random.default_rng(0)
 
     def draw(shape):
-        if spec.is_image:
+        if spec.observation_dtype == "uint8":
             return jnp.asarray(rng.integers(0, 256, (size, *shape)), jnp.uint8)
         return jnp.asarray(rng.normal(size=(size, *shape)), jnp.float32)
 
@@ -266,14 +281,14 @@ def draw_batch(spec: EnvSpec, size: int) -> Batch:
         next_observation=following,
         goal=goal,
         subgoal_candidate=Subgoal(observation, goal),
-        outcome=None if spec.goal_is_observation and not spec.is_image else Outcome(*truth),
+        outcome=None if spec.goal_is_observation and not spec.state_shape else Outcome(*truth),
     )
 
 
 @pytest.mark.parametrize("kind", SPECS)
 def test_updates_are_those_of_the_tdm_and_leave_the_autoencoder(kind):
-    spec = SPECS[kind]
-    state, batch = leap.create(SMALL, spec, KEY), draw_batch(spec, 8)
+    state, spec = made(SMALL, kind)
+    batch = draw_batch(spec, 8)
     copies = arrays((state, batch))
     after, metrics = eqx.filter_jit(leap.AGENT.update)(state, batch, KEY)
     assert all(np.array_equal(a, b) for a, b in zip(copies, arrays((state, batch)), strict=True))
@@ -355,15 +370,6 @@ def test_episodes_that_rest_make_no_plan():
     latents = leap.plan_where_due(state, start, start, rested, KEY)
     np.testing.assert_array_equal(latents[::2], 0)
     assert jnp.abs(latents[1]).max() > 0
-
-
-def on_features(config):
-    """Return LEAP as it acts on images: made for the latents of its frozen autoencoder."""
-    pictured = leap.create(config, SPECS["images"], KEY)
-    encoder = leap.AGENT.freezing.encoder(pictured)
-    spec = freeze.encoded_spec(SPECS["images"], encoder)
-    fresh = leap.create(config, spec, KEY)
-    return freeze.keep(leap.AGENT, fresh, pictured), spec, encoder
 
 
 def test_leap_freezes_its_autoencoder_before_the_first_update():
