@@ -7,12 +7,15 @@ import ast
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeVar, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 from midway.types import ConfigurationError
 
 T = TypeVar("T")
 Config = TypeVar("Config")
+
+Bound: TypeAlias = int | float | None
+"""A whole number stays one, so that messages show it as one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,10 +36,10 @@ class Allowed:
     source: str = ""
     meaning: str = ""
     deviates: str = ""
-    least: float | None = None
-    above: float | None = None
-    most: float | None = None
-    below: float | None = None
+    least: Bound = None
+    above: Bound = None
+    most: Bound = None
+    below: Bound = None
     choices: tuple[Any, ...] = ()
 
     def complaint(self, value: Any) -> str:
@@ -52,7 +55,7 @@ class Allowed:
                 return f"must be {self._range()}"
         return ""
 
-    def _inside(self, number: float) -> bool:
+    def _inside(self, number: int | float) -> bool:
         return (
             (self.least is None or number >= self.least)
             and (self.above is None or number > self.above)

@@ -5,7 +5,7 @@ Formulas, reasons and measured effects: docs/algorithms/ris.md, section "Beyond 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -49,6 +49,7 @@ class SubgoalSettings(Settings):
     candidate_pairs: int = setting(32, "none", "rows with candidates of their own", least=1)
 
 
+@runtime_checkable
 class ActorCritic(EncoderConfig, Protocol):
     """What encoder, critics and policy need of a configuration besides `Settings`."""
 
@@ -69,6 +70,7 @@ class ActorCritic(EncoderConfig, Protocol):
         """What networks read of a goal."""
 
 
+@runtime_checkable
 class Discounted(Protocol):
     """Settings with a discount factor γ, which each agent declares beside its own."""
 
@@ -93,6 +95,7 @@ class Discounted(Protocol):
         """Whether goals that are reached already are drawn again."""
 
 
+@runtime_checkable
 class Weighed(Discounted, Protocol):
     """Settings with candidates of each pair, and a temperature λ."""
 
