@@ -10,11 +10,20 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, runti
 
 from jaxtyping import Array, Bool, Float, Key, PyTree, Shaped
 
-from midway.types import AnyArray, Batch, EnvSpec, Hyperparameters, Metrics, Sampling, Subgoal
+from midway.types import (
+    AnyArray,
+    Batch,
+    Dataclass,
+    EnvSpec,
+    Hyperparameters,
+    Metrics,
+    Sampling,
+    Subgoal,
+)
 
 
 @runtime_checkable
-class AgentState(Protocol):
+class AgentState(Dataclass, Protocol):
     """What every agent's state holds besides its networks and optimisers."""
 
     @property

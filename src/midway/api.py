@@ -121,9 +121,12 @@ def resume(
     """
     folder = RunFolder(Path(path))
     config = folder.load_config()
-    named = {"steps": steps, "devices": devices}
-    given = {name: int(v) for name, v in named.items() if v is not None}
-    config = dataclasses.replace(config, train=dataclasses.replace(config.train, **given))
+    train = dataclasses.replace(
+        config.train,
+        steps=config.train.steps if steps is None else int(steps),
+        devices=config.train.devices if devices is None else int(devices),
+    )
+    config = dataclasses.replace(config, train=train)
     setup = setup_of(config, folder)
     folder.note_resume(config)
     return _run(config, folder, setup, progress)

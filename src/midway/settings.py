@@ -7,12 +7,15 @@ import ast
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from midway.types import ConfigurationError, Hyperparameters
 
 T = TypeVar("T")
 Config = TypeVar("Config", bound=Hyperparameters)
+
+Bound: TypeAlias = int | float | None
+"""A whole number stays one, so that messages show it as one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,10 +36,10 @@ class Allowed:
     source: str = ""
     meaning: str = ""
     deviates: str = ""
-    least: float | None = None
-    above: float | None = None
-    most: float | None = None
-    below: float | None = None
+    least: Bound = None
+    above: Bound = None
+    most: Bound = None
+    below: Bound = None
     choices: tuple[object, ...] = ()
 
     def complaint(self, value: object) -> str:
@@ -52,7 +55,7 @@ class Allowed:
                 return f"must be {self._range()}"
         return ""
 
-    def _inside(self, number: float) -> bool:
+    def _inside(self, number: int | float) -> bool:
         return (
             (self.least is None or number >= self.least)
             and (self.above is None or number > self.above)
@@ -150,7 +153,7 @@ def _converted(name: str, old: object, value: object) -> object:
             value = ast.literal_eval(value)
         except (ValueError, SyntaxError):
             raise ConfigurationError(f"{name} {value!r}: not a {type(old).__name__}") from None
-    if dataclasses.is_dataclass(old) and not isinstance(value, type(old)):
+    if isinstance(old, Hyperparameters) and not isinstance(value, type(old)):
         return _of_parts(name, old, value)
     if isinstance(old, tuple) and isinstance(value, list):
         value = tuple(value)
@@ -160,7 +163,7 @@ def _converted(name: str, old: object, value: object) -> object:
         value = int(value)
     if type(value) is not type(old):
         raise ConfigurationError(f"{name} {value!r}: must be a {type(old).__name__}")
-    if isinstance(old, tuple):
+    if isinstance(old, tuple) and isinstance(value, tuple):
         return tuple(_converted(name, _example(old), part) for part in value)
     return value
 

@@ -35,10 +35,14 @@ JsonObject: TypeAlias = dict[str, Any]
 
 
 @runtime_checkable
-class Hyperparameters(Protocol):
-    """A frozen dataclass of settings (`midway.settings`)."""
+class Dataclass(Protocol):
+    """An instance of any dataclass."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
+Hyperparameters: TypeAlias = Dataclass
+"""A frozen dataclass of settings (`midway.settings`)."""
 
 
 class ConfigurationError(ValueError):

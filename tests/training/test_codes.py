@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from midway.training.folder import RunFolder
 from small import SMALL
 
 import midway
@@ -15,7 +16,6 @@ from midway.replay import buffer
 from midway.training import api, codes, step
 from midway.training.arrays import named_arrays
 from midway.training.config import TrainConfig
-from midway.training.folder import RunFolder
 from midway.training.loop import Training
 from midway.types import ConfigurationError
 

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from midway.training.folder import RunFolder
 from safetensors.numpy import load_file
 
 import midway
@@ -14,7 +15,6 @@ from midway.agents import leap, sac, tdm
 from midway.reports import reconstructions, runs
 from midway.training import pretrain
 from midway.training.evaluate import run_episodes
-from midway.training.folder import RunFolder
 from midway.training.progress import Silent
 from midway.types import ConfigurationError, NonFiniteError, Pretraining
 

@@ -4,19 +4,23 @@ Formulas, reasons and measured effects: docs/algorithms/ris.md, section "Beyond 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Key, PyTree
 
 from midway import functional
-from midway.networks.inputs import GOAL_INPUTS, GoalInputs
-from midway.networks.policies import SubgoalPolicy
+from midway.networks import encoder as encoders
+from midway.networks import inputs
+from midway.networks.critics import TwinCritic
+from midway.networks.encoder import Encoder, EncoderConfig
+from midway.networks.inputs import GOAL_INPUTS, GoalInputs, PairInputs
+from midway.networks.policies import GaussianPolicy, SubgoalPolicy
 from midway.settings import setting
-from midway.types import Batch, Metrics, Sampling
+from midway.types import Batch, EnvSpec, Metrics, Sampling, Subgoal
 
 State = TypeVar("State", bound=eqx.Module)
 
@@ -45,6 +49,28 @@ class SubgoalSettings(Settings):
     candidate_pairs: int = setting(32, "none", "rows with candidates of their own", least=1)
 
 
+@runtime_checkable
+class ActorCritic(EncoderConfig, Protocol):
+    """What encoder, critics and policy need of a configuration besides `Settings`."""
+
+    @property
+    def hidden(self) -> tuple[int, ...]:
+        """Layers of every network."""
+
+    @property
+    def num_critics(self) -> int:
+        """Q networks."""
+
+    @property
+    def layer_norm(self) -> bool:
+        """Whether critics have it."""
+
+    @property
+    def goal_inputs(self) -> GoalInputs:
+        """What networks read of a goal."""
+
+
+@runtime_checkable
 class Discounted(Protocol):
     """Settings with a discount factor γ, which each agent declares beside its own."""
 
@@ -69,9 +95,55 @@ class Discounted(Protocol):
         """Whether goals that are reached already are drawn again."""
 
 
-def sampling(config: "Discounted", in_between: bool = False) -> Sampling:
+@runtime_checkable
+class Weighed(Discounted, Protocol):
+    """Settings with candidates of each pair, and a temperature λ."""
+
+    @property
+    def advantage_temperature(self) -> float:
+        """λ."""
+
+    @property
+    def candidates_per_pair(self) -> int:
+        """Candidates of each pair."""
+
+    @property
+    def candidate_pairs(self) -> int:
+        """Rows of the batch that have them."""
+
+
+def actor_critic(
+    config: "ActorCritic", spec: EnvSpec, keys: tuple[Key[Array, ""], ...]
+) -> tuple[Encoder, TwinCritic, GaussianPolicy]:
+    """Return encoder, critics and policy at their random start, from a key for each."""
+    encoder = encoders.create(spec, config, keys[0])
+    read = inputs.create(spec, config.goal_inputs, encoders.scale(encoder))
+    pair, layers = pair_size(spec, read), (config.hidden, config.precision)
+    critic = TwinCritic(
+        pair + spec.action_dim,
+        *layers,
+        key=keys[1],
+        inputs=read,
+        layer_norm=config.layer_norm,
+        count=config.num_critics,
+    )
+    return encoder, critic, GaussianPolicy(pair, spec.action_dim, *layers, key=keys[2], inputs=read)
+
+
+def pair_size(spec: EnvSpec, read: PairInputs) -> int:
+    """Return how many numbers networks read of a state and a goal."""
+    observation_size, goal_size = encoders.feature_sizes(spec)
+    return observation_size + read.size(goal_size)
+
+
+def sampling(config: Discounted) -> Sampling:
     """Return what an agent of these settings wants to be drawn."""
-    return Sampling(config.n_step, config.unreached_goals, config.hindsight_bound, in_between)
+    return Sampling(config.n_step, config.unreached_goals, config.hindsight_bound)
+
+
+def subgoal_sampling(config: "Weighed") -> Sampling:
+    """Return what RIS wants to be drawn: states in between for candidates of each pair too."""
+    return replace(sampling(config), between=config.candidates_per_pair > 1)
 
 
 def n_step_target(
@@ -121,10 +193,10 @@ def candidates_of_each_pair(batch: Batch, count: int, pairs: int) -> tuple[Batch
 
 def candidate_loss(
     subgoal_policy: SubgoalPolicy,
-    cost_of: Callable[[Batch, Float[Array, "M S"]], Float[Array, " M"]],
+    cost_of: Callable[[Batch, Subgoal], Float[Array, " M"]],
     batch: Batch,
-    settings: SubgoalSettings,
-    temperature: float,
+    spec: EnvSpec,
+    config: "Weighed",
 ) -> tuple[Float[Array, ""], Metrics]:
     """Return the loss of eq. 17 where each pair has candidates, and a softmax, of its own.
 
@@ -134,11 +206,11 @@ def candidate_loss(
         subgoal_policy: π^H.
         cost_of: The cost of one candidate for each row of a batch.
         batch: Transitions with candidates and states in between.
-        settings: How many candidates, for how many rows.
-        temperature: λ.
+        spec: The environment.
+        config: How many candidates, for how many rows, and λ.
     """
     few, candidates = candidates_of_each_pair(
-        batch, settings.candidates_per_pair, settings.candidate_pairs
+        batch, config.candidates_per_pair, config.candidate_pairs
     )
     count = candidates.shape[1]
     repeated = few._replace(
@@ -146,8 +218,10 @@ def candidate_loss(
         goal=jnp.repeat(few.goal, count, axis=0),
     )
     flat = candidates.reshape(-1, candidates.shape[-1])
-    cost = jax.lax.stop_gradient(cost_of(repeated, flat)).reshape(-1, count)
-    weight = candidate_weights(cost, temperature)
+    cost = jax.lax.stop_gradient(cost_of(repeated, encoders.as_subgoal(spec, flat))).reshape(
+        -1, count
+    )
+    weight = candidate_weights(cost, config.advantage_temperature)
     subgoals = subgoal_policy(few.observation[:, None], few.goal[:, None])
     log_density = subgoals.log_density(subgoal_policy.inputs.pick(candidates))
     loss = -(weight * log_density).sum(1).mean()
@@ -160,10 +234,11 @@ def candidate_loss(
 
 
 def every(
-    count: int,
     updates: Int[Array, ""],
-    step: Callable[[State], tuple[State, Metrics]],
+    count: int,
+    step: Callable[..., tuple[State, Metrics]],
     state: State,
+    *inputs: PyTree,
 ) -> tuple[State, Metrics]:
     """Return the state after a step that is taken in one of ``count`` updates only.
 
@@ -171,11 +246,11 @@ def every(
     many updates are means over its own.
     """
     if count == 1:
-        return step(state)
+        return step(state, *inputs)
     arrays, static = eqx.partition(state, eqx.is_array)
 
     def taken(arrays: State) -> tuple[State, Metrics]:
-        new, metrics = step(eqx.combine(arrays, static))
+        new, metrics = step(eqx.combine(arrays, static), *inputs)
         return eqx.filter(new, eqx.is_array), {k: count * v for k, v in metrics.items()}
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(taken, arrays)[1])

@@ -25,7 +25,7 @@ from midway.networks import vae as vaes
 from midway.networks.vae import ImageVAE, LatentMean, StateVAE
 from midway.planning import cem
 from midway.settings import setting
-from midway.types import EnvSpec, Metrics, Subgoal
+from midway.types import AnyArray, EnvSpec, Metrics, Subgoal
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,10 @@ def plan_where_due(
 
     def one(row: tuple[Array, ...]) -> Float[Array, "N L"]:
         due, *inputs = row
-        return jax.lax.cond(due, lambda *x: plan(state, *x), lambda *x: x[3], *inputs)
+        planned: Float[Array, "N L"] = jax.lax.cond(
+            due, lambda *x: plan(state, *x), lambda *x: x[3], *inputs
+        )
+        return planned
 
     keys = jax.random.split(key, len(due))
     rows = (due, observation, goal, segment, memory.latents, keys)
@@ -280,7 +283,7 @@ def act_on(
     return actions, memory._replace(elapsed=memory.elapsed + 1)
 
 
-def rest(memory: Memory, done: Bool[Array, " B"]) -> Memory:
+def rest(memory: Memory, done: Bool[AnyArray, " B"]) -> Memory:
     """Return the memory with these episodes far beyond their last segment, where none plans."""
     beyond = 2**30
     return memory._replace(elapsed=jnp.where(done, beyond, memory.elapsed))

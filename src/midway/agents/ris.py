@@ -5,6 +5,7 @@ networks that the step before has just updated.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -13,12 +14,12 @@ import optax
 from jaxtyping import Array, Float, Key, Shaped
 
 from midway import functional
-from midway.agent import Agent, Freezing, SubgoalDistribution, Value
+from midway.agent import Agent, Freezing, Inputs, SubgoalDistribution, Value
 from midway.agents import beyond
 from midway.networks import encoder as encoders
-from midway.networks import inputs, optimizer
+from midway.networks import optimizer
 from midway.networks.critics import TwinCritic
-from midway.networks.encoder import Encoder, StateEncoder
+from midway.networks.encoder import Encoder
 from midway.networks.mlp import PRECISIONS, Precision
 from midway.networks.policies import GaussianPolicy, SubgoalPolicy
 from midway.settings import check, setting
@@ -76,18 +77,6 @@ def as_subgoal(
     return encoders.as_subgoal(state.spec, state.policy.inputs.embed(observation, predicted))
 
 
-def subgoal_candidates(encoder: Encoder, batch: Batch, features: Float[Array, "B S"]) -> Subgoal:
-    """Return the features of the states drawn from replay as candidates (eq. 17).
-
-    For images these are the features of the batch's own observations, each beside another
-    transition: as uniform as any draws, and no further pass through the encoder.
-    """
-    if isinstance(encoder, StateEncoder):
-        return Subgoal(*map(encoder, batch.subgoal_candidate))
-    shifted = jnp.roll(features, 1, axis=0)
-    return Subgoal(shifted, shifted)
-
-
 def critic_target(state: State, batch: Batch, noise: Float[Array, "B A"]) -> Float[Array, " B"]:
     """Return r + γ (1 - terminated) min Q'(s', a', g), a' ~ π_θ; there is no entropy term."""
     next_action = jnp.tanh(state.policy(batch.next_observation, batch.goal).sample(noise))
@@ -101,10 +90,7 @@ def critic_loss(
     batch: Batch,
     target: Float[Array, " B"],
 ) -> tuple[Float[Array, ""], tuple[Float[Array, "B S"], Metrics]]:
-    """Return the loss of the critics, and the features of the current observations.
-
-    Only the current observation is encoded with gradient; the batch holds features.
-    """
+    """Return the loss of the critics, and the features of the current observations."""
     critic, encoder = networks
     features = encoder(observation)
     q = critic(features, batch.action, batch.goal)
@@ -143,13 +129,8 @@ def subgoal_loss(
 ) -> tuple[Float[Array, ""], Metrics]:
     """Return the weighted negative log-likelihood of the candidates (eq. 17)."""
     if state.config.candidates_per_pair > 1:
-        return beyond.candidate_loss(
-            subgoal_policy,
-            lambda rows, x: subgoal_cost(state, rows, encoders.as_subgoal(state.spec, x)),
-            batch,
-            state.config,
-            state.config.advantage_temperature,
-        )
+        cost_of = partial(subgoal_cost, state)
+        return beyond.candidate_loss(subgoal_policy, cost_of, batch, state.spec, state.config)
     subgoals = subgoal_policy(batch.observation, batch.goal)
     advantage = jax.lax.stop_gradient(subgoal_advantage(state, batch, subgoals.location))
     weight = functional.advantage_weights(advantage, state.config.advantage_temperature)
@@ -203,16 +184,13 @@ def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metr
     state, features, critic_metrics = update_critic(state, observation, batch, target_key)
     batch = batch._replace(
         observation=features,
-        subgoal_candidate=subgoal_candidates(state.encoder, batch, features),
+        subgoal_candidate=encoders.candidates(state.encoder, batch, features),
         between=None if batch.between is None else state.encoder(batch.between),
     )
-    state, subgoal_metrics = beyond.every(
-        config.subgoal_every, done, lambda state: update_subgoal_policy(state, batch), state
-    )
-    keys = subgoal_key, action_key
-    state, policy_metrics = beyond.every(
-        config.policy_every, done, lambda state: update_policy(state, batch, *keys), state
-    )
+    due = partial(beyond.every, done)
+    state, subgoal_metrics = due(config.subgoal_every, update_subgoal_policy, state, batch)
+    keys = (subgoal_key, action_key)
+    state, policy_metrics = due(config.policy_every, update_policy, state, batch, *keys)
     return update_targets(state), critic_metrics | subgoal_metrics | policy_metrics
 
 
@@ -267,19 +245,13 @@ def update_targets(state: State) -> State:
 
 
 def act(
-    state: State,
-    observation: Shaped[Array, "B ..."],
-    goal: Shaped[Array, "B ..."],
-    key: Key[Array, ""],
-    explore: bool,
+    state: State, observation: Inputs, goal: Inputs, key: Key[Array, ""], explore: bool
 ) -> Float[Array, "B A"]:
     """Return actions in [-1, 1] of the flat policy: sampled where ``explore``, else the mean's."""
     return state.policy(state.encoder(observation), state.encoder(goal)).act(key, explore)
 
 
-def subgoal_distribution(
-    state: State, observation: Shaped[Array, "B ..."], goal: Shaped[Array, "B ..."]
-) -> SubgoalDistribution:
+def subgoal_distribution(state: State, observation: Inputs, goal: Inputs) -> SubgoalDistribution:
     """Return π^H_ψ(· | s, g) in the environment's units, one Laplace for each pair."""
     features = state.encoder(observation)
     subgoals = state.subgoal_policy(features, state.encoder(goal))
@@ -294,21 +266,12 @@ def subgoal_distribution(
 def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     """Return networks at their random start; the target networks equal the online ones."""
     encoder_key, critic_key, subgoal_key, policy_key = jax.random.split(key, 4)
-    encoder = encoders.create(spec, config, encoder_key)
-    read = inputs.create(spec, config.goal_inputs, encoders.scale(encoder))
-    observation_size, goal_size = encoders.feature_sizes(spec)
-    pair, layers = observation_size + read.size(goal_size), (config.hidden, config.precision)
-    critic = TwinCritic(
-        pair + spec.action_dim,
-        *layers,
-        key=critic_key,
-        inputs=read,
-        layer_norm=config.layer_norm,
-        count=config.num_critics,
-    )
-    subgoal_size = len(read.coordinates) or encoders.subgoal_size(spec)
-    subgoal_policy = SubgoalPolicy(pair, subgoal_size, *layers, key=subgoal_key, inputs=read)
-    policy = GaussianPolicy(pair, spec.action_dim, *layers, key=policy_key, inputs=read)
+    keys = (encoder_key, critic_key, policy_key)
+    encoder, critic, policy = beyond.actor_critic(config, spec, keys)
+    read = policy.inputs
+    sizes = beyond.pair_size(spec, read), len(read.coordinates) or encoders.subgoal_size(spec)
+    layers = (config.hidden, config.precision)
+    subgoal_policy = SubgoalPolicy(*sizes, *layers, key=subgoal_key, inputs=read)
     return State(
         encoder=encoder,
         critic=critic,
@@ -333,6 +296,6 @@ AGENT = Agent(
     networks=("encoder", "critic", "target_critic", "subgoal_policy", "policy", "prior_policy"),
     value=Value(encoders.on_observations(value), "value: minus discounted steps to the goal"),
     subgoals=subgoal_distribution,
-    sampling=lambda config: beyond.sampling(config, in_between=config.candidates_per_pair > 1),
+    sampling=beyond.subgoal_sampling,
     freezing=Freezing(lambda state: state.encoder),
 )

@@ -17,7 +17,7 @@ from midway import functional
 from midway.agent import Agent, Freezing, Value
 from midway.agents import beyond
 from midway.networks import encoder as encoders
-from midway.networks import inputs, optimizer
+from midway.networks import optimizer
 from midway.networks.critics import TwinCritic
 from midway.networks.encoder import Encoder
 from midway.networks.mlp import PRECISIONS, Precision
@@ -124,9 +124,8 @@ def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metr
     observation, batch = encoders.encode_batch(state.encoder, batch, encoding_key)
     state, features, critic_metrics = update_critic(state, observation, batch, target_key)
     batch = batch._replace(observation=features)
-    state, policy_metrics = beyond.every(
-        state.config.policy_every, done, lambda s: update_policy(s, batch, action_key), state
-    )
+    count = state.config.policy_every
+    state, policy_metrics = beyond.every(done, count, update_policy, state, batch, action_key)
     target_critic = functional.target_update(
         state.critic, state.target_critic, state.config.target_update_rate
     )
@@ -187,19 +186,8 @@ def act(
 def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     """Return networks at their random start; the target critics equal the critics."""
     encoder_key, critic_key, policy_key = jax.random.split(key, 3)
-    encoder = encoders.create(spec, config, encoder_key)
-    read = inputs.create(spec, config.goal_inputs, encoders.scale(encoder))
-    observation_size, goal_size = encoders.feature_sizes(spec)
-    pair, layers = observation_size + read.size(goal_size), (config.hidden, config.precision)
-    critic = TwinCritic(
-        pair + spec.action_dim,
-        *layers,
-        key=critic_key,
-        inputs=read,
-        layer_norm=config.layer_norm,
-        count=config.num_critics,
-    )
-    policy = GaussianPolicy(pair, spec.action_dim, *layers, key=policy_key, inputs=read)
+    keys = (encoder_key, critic_key, policy_key)
+    encoder, critic, policy = beyond.actor_critic(config, spec, keys)
     log_entropy_coefficient = jnp.zeros(())
     return State(
         encoder=encoder,

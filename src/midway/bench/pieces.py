@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.extend.core
@@ -333,7 +333,7 @@ def _product_flops(function: Callable[..., PyTree], arguments: tuple[PyTree, ...
     return sum(_products(jax.make_jaxpr(function)(*arguments).jaxpr))
 
 
-def _products(jaxpr: jax.extend.core.Jaxpr) -> list[float]:
+def _products(jaxpr: Any) -> list[float]:
     """Return 2 x outputs x contracted length of each product, also of inner functions and loops."""
     found = []
     for equation in jaxpr.eqns:

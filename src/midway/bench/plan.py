@@ -3,6 +3,7 @@
 import statistics
 import time
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,13 +13,14 @@ from midway import api
 from midway.agents import leap
 from midway.bench.pieces import Figures
 from midway.envs import registry as environments
+from midway.networks.mlp import Precision
 
 REPETITIONS = 3
 """Without a warm-up, for a plan can take half a minute; it is compiled before."""
 
 
 def plan(
-    env: str, precision: str, samples: int | None = None, subgoals: int | None = None
+    env: str, precision: Precision, samples: int | None = None, subgoals: int | None = None
 ) -> Figures:
     """Time one plan at the start of one episode, with the preset ``paper`` and untrained networks.
 
@@ -29,6 +31,7 @@ def plan(
         subgoals: Subgoals of the plan, instead of the preset's.
     """
     config = api.configure(env, "leap", "paper").hyperparameters
+    assert isinstance(config, leap.Config)
     config = replace(
         config,
         precision=precision,
@@ -44,7 +47,7 @@ def plan(
         jnp.zeros((config.num_subgoals, config.latent_size)),
         jax.random.key(1),
     )
-    search = eqx.filter_jit(leap.plan)
+    search: Any = eqx.filter_jit(leap.plan)
     compiled = search.lower(state, *inputs).compile()
     times = []
     for _ in range(REPETITIONS):

@@ -1,6 +1,6 @@
 """The single environments that Gymnasium makes: batches of one."""
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -32,7 +32,7 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
     def __init__(self, name: str, task: str = "uniform") -> None:
         self.vector = make_vec(name, num_envs=1, task=task, num_threads=1)
         self.goal_spec = self.vector.goal_spec
-        self.observation_space: gymnasium.Space[Observations] = self.vector.single_observation_space
+        self.observation_space: gymnasium.Space[Any] = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
 
     def reset(

@@ -241,6 +241,18 @@ class Sees(Protocol):
         """The encoder."""
 
 
+def candidates(encoder: Encoder, batch: Batch, features: Float[Array, "B S"]) -> Subgoal:
+    """Return the features of the states drawn from replay as subgoal candidates (eq. 17).
+
+    For images these are the features of the batch's own observations, each beside another
+    transition: as uniform as any draws, and no further pass through the encoder.
+    """
+    if isinstance(encoder, StateEncoder):
+        return Subgoal(*map(encoder, batch.subgoal_candidate))
+    shifted = jnp.roll(features, 1, axis=0)
+    return Subgoal(shifted, shifted)
+
+
 def on_observations(function: Callable[..., T]) -> Callable[..., T]:
     """Return a function of (state, features, features) as one of what the environment shows."""
 

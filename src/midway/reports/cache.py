@@ -95,6 +95,11 @@ class Study:
         return recordings.plans(self.agent)
 
     @property
+    def value_unit(self) -> str | None:
+        """What the agent's values are; None if it has none."""
+        return None if self.agent.value is None else self.agent.value.unit
+
+    @property
     def where(self) -> str:
         """The run's seed and the step of its policy, for captions."""
         return f"seed {self.run.config.seed}, step {self.run.policy_step:,}"
@@ -179,11 +184,11 @@ class Study:
 
     def chain(self) -> Table:
         """Return the positions of the subgoal chain of the hard task."""
-        return self._way("chain", lambda *pair: chain(self.policy, *pair, CHAIN_DEPTH))
+        return self._way("chain", lambda start, goal: chain(self.policy, start, goal, CHAIN_DEPTH))
 
     def plan(self) -> Table:
         """Return the positions of the subgoals that are planned for the hard task."""
-        return self._way("plan", lambda *pair: first_plan(self.policy, *pair))
+        return self._way("plan", lambda start, goal: first_plan(self.policy, start, goal))
 
     def ends(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
         """Return the positions of start and goal in the middle of the hard task's boxes (m)."""
@@ -340,9 +345,10 @@ def chain(
     if depth == 0:
         return np.empty((0, *goal.shape))
     middle = policy.subgoals(observation[None], goal[None]).location
-    before = chain(policy, observation, middle.achieved_goal[0], depth - 1)
-    after = chain(policy, middle.observation[0], goal, depth - 1)
-    return np.concatenate([before, middle.achieved_goal, after])
+    reached, onwards = np.asarray(middle.achieved_goal), np.asarray(middle.observation)
+    before = chain(policy, observation, reached[0], depth - 1)
+    after = chain(policy, onwards[0], goal, depth - 1)
+    return np.concatenate([before, reached, after])
 
 
 def first_plan(
@@ -353,7 +359,7 @@ def first_plan(
     actor(observation[None], goal[None])
     found = recordings.plan(policy, actor.memory)
     assert found is not None
-    return found[0]
+    return np.asarray(found[0])
 
 
 def grid(maze: Maze) -> tuple[Float[np.ndarray, " columns"], Float[np.ndarray, " rows"]]:

@@ -169,6 +169,7 @@ def reconstructions(
     """Return new states and what is left of them after encoding and decoding."""
     env = environments.make_vec(policy.config.env, num_envs=IMAGES)
     count = IMAGES if policy.spec.is_image else STATES
+    assert policy.agent.pretrain is not None
     states = sample_states(env, PretrainSettings((), count, ACTIONS, rounds=0), SEED)
     kept = _reconstructed(policy.agent.pretrain.reconstruct, policy.state, states)
     return np.asarray(states.observation), np.asarray(kept)

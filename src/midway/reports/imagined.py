@@ -44,10 +44,10 @@ def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
     for group, study in firsts:
         if study.imagines:
             yield _subgoal_picture(runs, cache, group, study)
-    judged = [(group, study) for group, study in firsts if study.agent.value is not None]
-    for unit in dict.fromkeys(study.agent.value.unit for _, study in judged):
-        alike = [(group, study) for group, study in judged if study.agent.value.unit == unit]
-        yield _value_picture(runs, unit, alike)
+    for unit in dict.fromkeys(study.value_unit for _, study in firsts):
+        if unit is not None:
+            alike = [(group, study) for group, study in firsts if study.value_unit == unit]
+            yield _value_picture(runs, unit, alike)
 
 
 def _subgoal_picture(runs: Runs, cache: Cache, group: Group, study: Study) -> Picture:

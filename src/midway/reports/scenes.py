@@ -296,7 +296,7 @@ def decoding(folder: RunFolder, policy: Policy) -> Callable[[Recording], Images 
 
     def decode(recording: Recording) -> Images:
         if recording.plans is None:
-            features = imagined(policy, recording).location.achieved_goal
+            features = np.asarray(imagined(policy, recording).location.achieved_goal)
         else:
             features = _aims(recording.plans, policy.spec.max_episode_steps)
         return decoder.decoded(fitted, features)

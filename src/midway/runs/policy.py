@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
@@ -91,6 +92,7 @@ class Policy:
 
     def subgoals(self, observation: Seen, goal: Seen) -> SubgoalDistribution:
         """Return the subgoals imagined for each pair ``(B, ...)``; the agent must imagine any."""
+        assert self.agent.subgoals is not None
         found = _on_features(self.agent.subgoals, self.encoder, self.state, observation, goal)
         in_numpy: SubgoalDistribution = jax.tree.map(np.asarray, found)
         return in_numpy
@@ -104,9 +106,13 @@ def _features(encoder: Encoder | None, observation: Seen) -> AnyArray:
     return observation if encoder is None else _encoded(encoder, observation)
 
 
-@eqx.filter_jit
-def _encoded(encoder: Encoder, observation: Inputs) -> Float[Array, "B F"]:
-    return encoder(observation)
+def _read(encoder: Encoder | None, shown: Seen) -> Inputs:
+    """Return what an agent reads of observations or goals, inside a compiled function."""
+    array = jnp.asarray(shown)
+    return array if encoder is None else encoder(array)
+
+
+_encoded = eqx.filter_jit(_read)
 
 
 @eqx.filter_jit
@@ -114,11 +120,11 @@ def _on_features(
     function: Callable[..., Found],
     encoder: Encoder | None,
     state: AgentState,
-    observation: Inputs,
-    goal: Inputs,
+    observation: Seen,
+    goal: Seen,
     *others: object,
 ) -> Found:
-    pair = (observation, goal) if encoder is None else (encoder(observation), encoder(goal))
+    pair = (_read(encoder, observation), _read(encoder, goal))
     return function(state, *pair, *others)
 
 
@@ -128,13 +134,13 @@ def _act_on(
     encoder: Encoder | None,
     state: AgentState,
     memory: Memory,
-    observation: Inputs,
-    goal: Inputs,
+    observation: Seen,
+    goal: Seen,
     key: Key[Array, ""],
     *,
     explore: bool,
 ) -> tuple[Float[Array, "B A"], Memory]:
-    pair = (observation, goal) if encoder is None else (encoder(observation), encoder(goal))
+    pair = (_read(encoder, observation), _read(encoder, goal))
     return acting.act(agent, state, memory, *pair, key, explore=explore)
 
 

@@ -44,6 +44,11 @@ def keep(agent: AnyAgent, fresh: AgentState, state: AgentState) -> AgentState:
     return replace(fresh, **{name: getattr(state, name) for name in kept})
 
 
+def thawed(env: VectorGoalEnv) -> VectorGoalEnv:
+    """Return the environment itself, where it is seen through a frozen encoder."""
+    return env.env if isinstance(env, FrozenEnv) else env
+
+
 class FrozenEnv:
     """A vector environment of images seen through a frozen encoder: features in their place.
 

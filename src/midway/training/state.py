@@ -102,8 +102,7 @@ class Training:
     @property
     def env_spec(self) -> EnvSpec:
         """What agents may know of the environment itself, images included."""
-        env = self.collector.env
-        return (env.env if isinstance(env, freeze.FrozenEnv) else env).goal_spec
+        return freeze.thawed(self.collector.env).goal_spec
 
     def begin_episodes(self, count: int) -> Memory:
         """Return what the agent remembers at the start of as many episodes."""
@@ -260,7 +259,7 @@ def load_state_dict(training: Training, state: Stored) -> None:
         encoder = eqx.combine(with_named_arrays(weights, state[FROZEN]), static)
         env = training.collector.env
         training.encoder = encoder
-        training.collector.env = _seen(training.setup, env.env, encoder)
+        training.collector.env = _seen(training.setup, freeze.thawed(env), encoder)
     training.arrays = with_named_arrays(training.arrays, state["agent"])
     training.memory = with_named_arrays(training.memory, state.get("memory", {}))
     training.totals = state["totals"]
