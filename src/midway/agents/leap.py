@@ -280,7 +280,7 @@ def act_on(
     return actions, memory._replace(elapsed=memory.elapsed + 1)
 
 
-def rest(memory: Memory, done: Bool[Array, " B"]) -> Memory:
+def rest(memory: Memory, done: Bool[Any, " B"]) -> Memory:
     """Return the memory with these episodes far beyond their last segment, where none plans."""
     beyond = 2**30
     return memory._replace(elapsed=jnp.where(done, beyond, memory.elapsed))

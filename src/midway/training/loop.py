@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import jax
 import numpy as np
@@ -30,6 +30,7 @@ SNAPSHOTS = 8
 Clock: TypeAlias = dict[str, int | float]
 
 
+@runtime_checkable
 class Sinks(Protocol):
     """Where a run puts what others read: files and messages."""
 
