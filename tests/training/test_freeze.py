@@ -61,9 +61,7 @@ def test_the_specification_of_features_keeps_what_success_is_measured_on() -> No
 
 def test_what_an_agent_keeps_is_what_it_names() -> None:
     config = leap.Config(hidden=(8,), vae_hidden=(8,), latent_size=2)
-    first, second = (
-        leap.create(config, STATE_SPEC, jax.random.key(number)) for number in range(2)
-    )
+    first, second = (leap.create(config, STATE_SPEC, jax.random.key(number)) for number in range(2))
     kept = freeze.keep(leap.AGENT, first, second)
     assert kept.vae is second.vae
     assert kept.policy is first.policy
