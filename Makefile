@@ -11,7 +11,7 @@ QUICK := tests/test_architecture.py tests/test_dependencies.py tests/test_functi
 
 # Two workers share the files, so that a file trains its small runs once.
 PYTEST := $(BIN)/pytest --numprocesses auto --dist loadfile
-COVERAGE := --cov
+COVERAGE := --cov=midway
 
 .PHONY: train check test test-all test-lowest lint format clean
 
