@@ -4,13 +4,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN ?= runs/point-u
 
-# Tests that compile little: no agent is created, no run trained.
+# Tests that compile little: no agent is created, no run trained, no image encoded.
 QUICK := tests/test_architecture.py tests/test_dependencies.py tests/test_functional.py \
-	tests/networks tests/planning tests/replay
+	tests/networks/test_critics.py tests/networks/test_mlp.py tests/networks/test_policies.py \
+	tests/replay/test_replay_properties.py tests/replay/test_replay_uniform.py
 
 # Two workers share the files, so that a file trains its small runs once.
 PYTEST := $(BIN)/pytest --numprocesses auto --dist loadfile
-COVERAGE := --cov
+COVERAGE := --cov=midway
 
 .PHONY: train check test test-all test-lowest lint format clean
 
@@ -50,7 +51,7 @@ test-lowest:
 	$(VENV)-lowest/bin/python .ci/lowest.py > $(VENV)-lowest/constraints.txt
 	$(VENV)-lowest/bin/python -m pip install --quiet --editable '.[dev,cluster]' \
 		--constraint $(VENV)-lowest/constraints.txt
-	$(VENV)-lowest/bin/pytest --numprocesses auto --dist loadfile $(QUICK) tests/envs
+	$(VENV)-lowest/bin/pytest --numprocesses auto --dist loadfile $(QUICK) tests/envs/test_mazes.py tests/envs/test_point_maze.py
 
 lint: $(VENV)/installed
 	$(BIN)/ruff format --check .

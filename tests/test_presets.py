@@ -83,8 +83,10 @@ def test_values_are_those_of_the_presets_before(key: str) -> None:
     assert differ == INTENDED.get(key, {})
 
 
-INTENDED: dict[str, dict[str, tuple[object, object]]] = {}
-"""What is meant to differ: (before, now)."""
+NO_IMAGES: dict[str, tuple[object, object]] = {"freeze_encoder_after": (15_000, 0)}
+
+INTENDED = {"quick push-state ris": NO_IMAGES, "quick push-state sac": NO_IMAGES}
+"""What is meant to differ, (before, now): where there are no images, no encoder is frozen."""
 
 
 def test_later_rules_win(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -129,7 +129,7 @@ def test_training_compiles_once_and_moves_nothing_to_the_host(tmp_path: Path) ->
 
 
 class Line:
-    """One-dimensional walk for evaluation: each environment starts as far away as its number says."""
+    """One-dimensional walk for evaluation: each starts as far away as its number says."""
 
     tasks = ("near",)
 

@@ -62,7 +62,7 @@ class PairInputs(eqx.Module):
 
     def embed(
         self, observation: Float[Array, "*#B S"], coordinates: Float[Array, "*B C"]
-    ) -> Float[Array, "*B S"]:
+    ) -> Float[Array, "*B P"]:
         """Return the states at these coordinates that else are as the observations."""
         if not self.groups:
             return coordinates
@@ -72,7 +72,7 @@ class PairInputs(eqx.Module):
 
     def spread(
         self, observation: Float[Array, "*B S"], scale: Float[Array, "*B C"]
-    ) -> Float[Array, "*B S"]:
+    ) -> Float[Array, "*B P"]:
         """Return scales of whole states: 0 where `embed` takes the observation's entries."""
         return self.embed(jnp.zeros_like(observation), scale)
 

@@ -1,9 +1,10 @@
 """Learning curves: success and distances over environment steps and over training time."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -18,15 +19,16 @@ from midway.reports.statistics import Curve, Run, curve
 from midway.reports.style import Picture, thousands
 from midway.tables import Table
 
-Column: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
+Column: TypeAlias = Float[np.ndarray, " rows"]
 
 TASKS = {"hard": "hard task", "uniform": "uniform tasks"}
-LINES = {"mean": "-", "sampled": (0, (2, 1.5))}
+LineStyle: TypeAlias = str | tuple[int, tuple[int | float, ...]]
+LINES: dict[str, LineStyle] = {"mean": "-", "sampled": (0, (2, 1.5))}
 """Solid lines for the deterministic policy, dashed ones for sampled actions."""
 
 NAMES = {"mean": "deterministic policy", "sampled": "sampled actions"}
 
-NAME_LINES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1)))
+NAME_LINES: tuple[LineStyle, ...] = ("-", (0, (4, 1.5)), (0, (1, 1)))
 """Lines of several distances of one run."""
 
 DISTANCE = "final_distance_"
@@ -188,7 +190,7 @@ def draw_distances(runs: Runs) -> Figure:
         panel.set_xlim(left=0)
         panel.xaxis.set_major_formatter(thousands)
     if isinstance(runs.view, TableView):
-        look: dict[str, Any] = {"color": style.MUTED, "linestyle": ":", "linewidth": 1.4}
+        look: style.Look = {"color": style.MUTED, "linestyle": ":", "linewidth": 1.4}
         for panel in axes:
             panel.axhline(GOAL_THRESHOLD, **look)
         entries.append(Line2D([], [], label="near enough", **look))
@@ -237,7 +239,9 @@ def _draw_group(axes: Axes, group: Group, task: str, actions: str, clock: str) -
         _draw_curve(axes, group, actions, drawn)
 
 
-def _draw_curve(axes: Axes, group: Group, actions: str, drawn: Curve, line: Any = None) -> None:
+def _draw_curve(
+    axes: Axes, group: Group, actions: str, drawn: Curve, line: LineStyle | None = None
+) -> None:
     """Draw the line; for the deterministic policy also marks, and the interval of several runs."""
     axes.plot(
         drawn.x,
@@ -261,6 +265,6 @@ def _group_entries(groups: Sequence[Group]) -> list[Line2D]:
     ]
 
 
-def _line(colour: str, label: str, line: Any = "-", **look: Any) -> Line2D:
+def _line(colour: str, label: str, line: LineStyle = "-", **look: object) -> Line2D:
     """Return an entry of a legend."""
     return Line2D([], [], color=colour, linewidth=2, linestyle=line, label=label, **look)

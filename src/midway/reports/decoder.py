@@ -8,14 +8,14 @@ folder.
 import hashlib
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, TypeAlias
+from typing import TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Key, Shaped, UInt8
+from jaxtyping import Array, Float, Int, Key, PyTree, Shaped, UInt8
 
 from midway.agent import Encoder, PretrainSettings
 from midway.envs import registry as environments
@@ -24,7 +24,9 @@ from midway.runs.folder import RunFolder
 from midway.runs.policy import Policy
 from midway.training.arrays import load_arrays, named_arrays, save_arrays
 from midway.training.pretrain import sample_states
-from midway.types import ConfigurationError
+from midway.types import AnyArray, ConfigurationError, VectorGoalEnv
+
+Result = TypeVar("Result")
 
 VERSION = 2
 """Counted up when the same policy would get another decoder."""
@@ -101,7 +103,10 @@ def fit(policy: Policy, encoder: Encoder) -> ImageDecoder:
     return fit_to(_apply(encoder, images), images, jax.random.key(int(key_seed)), UPDATES)
 
 
-def decoded(decoder: Callable[[Any], Any], features: Float[Any, "B F"]) -> Images:
+def decoded(
+    decoder: Callable[[Float[Array, "B F"]], Float[Array, "B H W 3"]],
+    features: Float[AnyArray, "B F"],
+) -> Images:
     """Return the images that features stand for, uint8."""
     return as_images(np.asarray(_apply(decoder, features)))
 
@@ -117,8 +122,8 @@ def as_images(values: Float[np.ndarray, "B H W 3"]) -> Images:
 
 
 @eqx.filter_jit
-def _apply(function: Any, x: Any) -> Any:
-    return function(x)
+def _apply(function: Callable[[Array], Result], x: AnyArray) -> Result:
+    return function(jnp.asarray(x))
 
 
 def fit_to(
@@ -137,11 +142,18 @@ def fit_to(
 
 
 @eqx.filter_jit
-def _updates(fitted: Fit, features: Any, images: Any, key: Any, numbers: Any, updates: int) -> Fit:
+def _updates(
+    fitted: Fit,
+    features: Float[Array, "N F"],
+    images: UInt8[Array, "N 84 84 3"],
+    key: Key[Array, ""],
+    numbers: Int[Array, " n"],
+    updates: int,
+) -> Fit:
     """Return the decoder and its optimiser after the updates of these numbers."""
     arrays, static = eqx.partition(fitted, eqx.is_array)
 
-    def one(arrays: Any, number: Any) -> tuple[Any, None]:
+    def one(arrays: PyTree, number: Int[Array, ""]) -> tuple[PyTree, None]:
         decoder, state = eqx.combine(arrays, static)
         rows = jax.random.randint(
             jax.random.fold_in(key, number), (BATCH_SIZE,), 0, features.shape[0]
@@ -159,7 +171,7 @@ def _adam(updates: int) -> optax.GradientTransformation:
     return optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, updates))
 
 
-def sample_images(env: Any, count: int, seed: int) -> UInt8[np.ndarray, "N 84 84 3"]:
+def sample_images(env: VectorGoalEnv, count: int, seed: int) -> UInt8[np.ndarray, "N 84 84 3"]:
     """Return images of states after resets and after random actions, and every fourth of a goal.
 
     Args:

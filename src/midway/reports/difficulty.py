@@ -1,7 +1,7 @@
 """Success against difficulty: the length of the shortest path, and the numbered cases."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -147,7 +147,7 @@ def _draw_points(
 ) -> None:
     """Draw points (x, centre, low, high) with their intervals; ``fill`` is the marks' inside."""
     x, centre, low, high = np.array(points).T
-    look: dict[str, Any] = {"color": group.colour, "marker": group.marker, "linewidth": 1.8}
+    look: style.Look = {"color": group.colour, "marker": group.marker, "linewidth": 1.8}
     errors = np.maximum([centre - low, high - centre], 0)
     look |= {"markersize": 6, "markerfacecolor": fill or group.colour, "elinewidth": 1}
     axes.errorbar(x, centre, errors, **look, capsize=3)

@@ -3,7 +3,6 @@
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -215,5 +214,5 @@ def _write(axes: Axes, panel: Panel) -> None:
     axes.xaxis.label.set_horizontalalignment("left")
 
 
-def _entry(group: Group) -> Any:
+def _entry(group: Group) -> Line2D:
     return Line2D([], [], color=group.colour, linewidth=2, label=f"{group.label} ({group.seeds})")

@@ -1,15 +1,15 @@
 """What a policy sees and imagines, as images, and what an autoencoder keeps of states."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any, TypeAlias
+from collections.abc import Callable, Iterator, Mapping
+from typing import TypeAlias
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Array, Float, Shaped
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from midway.agent import PretrainSettings
+from midway.agent import AgentState, PretrainSettings
 from midway.envs import registry as environments
 from midway.envs.views import MazeView, TableView
 from midway.networks.decoder import ImageDecoder
@@ -22,6 +22,7 @@ from midway.reports.runs import Group, Runs
 from midway.reports.style import Picture
 from midway.runs.policy import Policy
 from midway.training.pretrain import sample_states
+from midway.types import NumPyArray, Subgoal
 
 Rows: TypeAlias = Mapping[str, Images]
 """Images of every configuration, by the name of their row."""
@@ -104,13 +105,13 @@ def draw(study: Study, label: str) -> Figure:
     widths[SHOWN["uniform"]] = GAP
     side = (style.WIDTH - SIDE) / sum(widths)
     height = len(names) * (side + 0.04) + 0.4
-    options: dict[str, Any] = {"gridspec_kw": {"width_ratios": widths}}
-    figure, axes = style.figure(len(names), columns, height=height, **options)
+    grid = {"width_ratios": widths}
+    figure, axes = style.figure(len(names), columns, height=height, gridspec_kw=grid)
     for row, name in enumerate(names):
         images = [*blocks["uniform"][name], None, *blocks["hard"][name]]
         for column, image in enumerate(images):
             _show(axes[row * columns + column], image)
-        look: dict[str, Any] = {"ha": "right", "va": "center", "color": style.INK}
+        look: style.Look = {"ha": "right", "va": "center", "color": style.INK}
         axes[row * columns].set_ylabel(name, rotation=0, fontsize=style.TEXT, **look)
     for task, column in (("uniform", 0), ("hard", SHOWN["uniform"] + 1)):
         axes[column].set_title(f"{label}, {task}", fontsize=style.TEXT, loc="left")
@@ -135,7 +136,7 @@ def rows(policy: Policy, decoder: ImageDecoder, task: str, count: int, seed: int
     }
 
 
-def _show(axes: Axes, image: Any) -> None:
+def _show(axes: Axes, image: NumPyArray | None) -> None:
     """Show an image without axes, or nothing."""
     axes.spines[:].set_visible(False)
     axes.grid(visible=False)
@@ -176,7 +177,9 @@ def reconstructions(
 
 
 @eqx.filter_jit
-def _reconstructed(reconstruct: Any, state: Any, states: Any) -> Any:
+def _reconstructed(
+    reconstruct: Callable[[AgentState, Subgoal], Array], state: AgentState, states: Subgoal
+) -> Array:
     return reconstruct(state, states)
 
 

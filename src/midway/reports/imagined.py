@@ -1,13 +1,13 @@
 """Imagined subgoals during training, the subgoal chain, and the value of a goal."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 
 from midway.envs.mazes import Maze
@@ -24,7 +24,7 @@ HEAT = LinearSegmentedColormap.from_list(
 )
 """From nothing over orange to vermilion."""
 
-DIAMOND: dict[str, Any] = {
+DIAMOND: style.Look = {
     "marker": "D",
     "color": maps.SUBGOAL,
     "markeredgecolor": style.INK,
@@ -119,8 +119,8 @@ def show_image(
     shades: Float[np.ndarray, "rows columns"],
     x: Float[np.ndarray, " columns"],
     y: Float[np.ndarray, " rows"],
-    **options: Any,
-) -> Any:
+    **options: object,
+) -> AxesImage:
     """Draw numbers at points of the plane as colours and return the image."""
     limits = axes.get_xlim(), axes.get_ylim()
     extent = (x[0], x[-1], y[0], y[-1])
@@ -169,7 +169,7 @@ def draw_values(studies: Mapping[str, Study], unit: str) -> Figure:
     x, y = grid(first.maze)
     # Values that count down to the goal end at 0.
     colours = {"cmap": "viridis", "vmin": lowest, "vmax": highest if highest > 0 else 0}
-    image: Any = None
+    image: AxesImage | None = None
     for panel, (label, study) in zip(axes, studies.items(), strict=True):
         shades = tables[label]["value"].reshape(len(y), len(x))
         image = show_image(panel, first.maze, shades, x, y, **colours, zorder=1)

@@ -1,7 +1,6 @@
 """Mazes from above, with what a policy does in them."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -148,7 +147,7 @@ def draw_ends(
     axes: Axes, start: Float[np.ndarray, "2"], goal: Float[np.ndarray, "2"], size: float = 1.0
 ) -> None:
     """Draw a start and a goal (m), with marks of a size relative to those of figures."""
-    outline: dict[str, Any] = {"markeredgecolor": "white", "zorder": 6, "linestyle": ""}
+    outline: style.Look = {"markeredgecolor": "white", "zorder": 6, "linestyle": ""}
     axes.plot(*start, marker="o", color=START, markersize=6 * size, **outline)
     axes.plot(*goal, marker="*", color=GOAL, markersize=12 * size, **outline)
 
@@ -163,7 +162,7 @@ def scatter_subgoals(axes: Axes, positions: Float[np.ndarray, "n 2"]) -> None:
 def draw_plan(axes: Axes, way: Float[np.ndarray, "N 2"]) -> None:
     """Draw planned subgoals in their order, on a line from the start to the goal (m)."""
     axes.plot(*way.T, color=SUBGOAL, linewidth=1.5, zorder=5)
-    look: dict[str, Any] = {"color": SUBGOAL, "markersize": 7, "markeredgecolor": style.INK}
+    look: style.Look = {"color": SUBGOAL, "markersize": 7, "markeredgecolor": style.INK}
     axes.plot(*way[1:-1].T, "D", zorder=6, **look)
     draw_ends(axes, way[0], way[-1])
 

@@ -1,19 +1,22 @@
 """Episodes of a saved policy, recorded step by step, with the subgoals on their way."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias, TypeVar
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from midway.agent import AnyAgent, SubgoalDistribution
+from midway.agent import AgentState, AnyAgent, Memory, SubgoalDistribution
 from midway.envs import registry as environments
 from midway.runs.policy import Policy
 from midway.training.evaluate import rollout
+from midway.types import NumPyArray, VectorGoalEnv
 
-Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
+Found = TypeVar("Found")
+
+Array: TypeAlias = NumPyArray
 
 SUBGOALS = 20
 """Imagined subgoals that are drawn for a state and a goal."""
@@ -109,7 +112,7 @@ def _recording(
     )
 
 
-def _reset(env: Any, tasks: Array, seed: int) -> dict[str, Array]:
+def _reset(env: VectorGoalEnv, tasks: Array, seed: int) -> dict[str, Array]:
     """Begin one episode in each environment, each with a task of its own."""
     observation: dict[str, Array] = {}
     for task in dict.fromkeys(tasks.tolist()):
@@ -123,7 +126,7 @@ def plans(agent: AnyAgent) -> bool:
     return agent.memory is not None and agent.memory.plan is not None
 
 
-def plan(policy: Policy, memory: Any) -> Array | None:
+def plan(policy: Policy, memory: Memory) -> Array | None:
     """Return the planned subgoals ``(B, N, G)`` that a memory holds; None if there are none."""
     ability = policy.agent.memory
     if ability is None or ability.plan is None:
@@ -132,7 +135,7 @@ def plan(policy: Policy, memory: Any) -> Array | None:
 
 
 @eqx.filter_jit
-def _plan(read: Any, state: Any, memory: Any) -> Any:
+def _plan(read: Callable[[AgentState, Memory], Found], state: AgentState, memory: Memory) -> Found:
     return read(state, memory)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from midway import tables
 from midway.agent import AnyAgent
@@ -16,7 +16,7 @@ from midway.envs.views import View
 from midway.reports import style
 from midway.runs.folder import RunConfig, RunFolder, read_json, run_name
 from midway.tables import Table
-from midway.types import ConfigurationError
+from midway.types import ConfigurationError, JsonObject
 
 Row: TypeAlias = dict[str, float]
 """One row of numbers by column."""
@@ -39,7 +39,7 @@ class RunData:
 
     folder: RunFolder
     config: RunConfig
-    record: dict[str, Any]
+    record: JsonObject
     metrics: Table
     evaluation: Table
 
@@ -241,7 +241,7 @@ def _place(known: Sequence[str], name: str) -> tuple[int, str]:
     return (known.index(name), "") if name in known else (len(known), name)
 
 
-def _settings(config: RunConfig) -> dict[str, Any]:
+def _settings(config: RunConfig) -> JsonObject:
     """Return all values that runs of one group share."""
     train = dataclasses.asdict(config.train)
     train = {name: value for name, value in train.items() if name not in WATCHING}

@@ -1,15 +1,17 @@
 """The pictures of an episode, step by step: a maze, the arm's table, or images side by side."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeAlias, cast, runtime_checkable
+from typing import Protocol, TypeAlias, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
+from matplotlib.text import Text
 
 from midway.envs import registry as environments
 from midway.envs.views import MazeView, TableView
@@ -19,7 +21,7 @@ from midway.reports.decoder import Images
 from midway.reports.recordings import Recording, imagined, in_every_state, plans
 from midway.runs.folder import RunFolder
 from midway.runs.policy import Policy
-from midway.types import ConfigurationError
+from midway.types import ConfigurationError, DistanceTask
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
 
@@ -82,7 +84,7 @@ class Stage:
             artist.set_animated(True)
         figure.set_dpi(PIXELS)
         style.settle(figure)
-        self._canvas = cast(Any, figure.canvas)
+        self._canvas = cast(FigureCanvasAgg, figure.canvas)
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(figure.bbox)
 
@@ -137,7 +139,7 @@ class MazeScene:
         return self._stage.frame()
 
     def _legend(self) -> list[Line2D]:
-        look: dict[str, Any] = {"color": style.BLUE, "marker": "o", "markersize": 9, "linewidth": 2}
+        look: style.Look = {"color": style.BLUE, "marker": "o", "markersize": 9, "linewidth": 2}
         entries = [Line2D([], [], label="agent", **look), *maps.ends_legend()]
         if self._subgoals is not None:
             entries.append(Line2D([], [], label=f"{self._kind} subgoals", **_diamonds()))
@@ -170,7 +172,7 @@ class TableScene:
             for marker in ("s", "o")
         ]
         self._hand = axes.plot([], [], "s", color=style.BLUE, markersize=11, zorder=7)[0]
-        look: dict[str, Any] = {"facecolor": style.BLUE, "alpha": 0.45, "zorder": 3}
+        look: style.Look = {"facecolor": style.BLUE, "alpha": 0.45, "zorder": 3}
         self._puck = Circle((0, 0), tabletop.PUCK_RADIUS, **look)
         axes.add_patch(self._puck)
         style.legend_below(figure, self._legend())
@@ -186,15 +188,15 @@ class TableScene:
             if self._subgoals is not None:
                 marks.set_data(*self._subgoals[step][:, part].T)
         self._hand.set_data(*self._states[step : step + 1, tabletop.HAND].T)
-        puck: Any = tuple(self._states[step, tabletop.PUCK])
-        self._puck.set_center(puck)
+        x, y = self._states[step, tabletop.PUCK].tolist()
+        self._puck.set_center((x, y))
         self._text.set_text(self._words.after(step))
         return self._stage.frame()
 
     def _legend(self) -> list[Line2D]:
-        hollow: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 2, "markersize": 10}
-        look: dict[str, Any] = {"linestyle": "", "color": style.BLUE}
-        goal: dict[str, Any] = {"linestyle": "", "color": maps.GOAL}
+        hollow: style.Look = {"markerfacecolor": "none", "markeredgewidth": 2, "markersize": 10}
+        look: style.Look = {"linestyle": "", "color": style.BLUE}
+        goal: style.Look = {"linestyle": "", "color": maps.GOAL}
         entries = [
             Line2D([], [], marker="s", label="hand", **look),
             Line2D([], [], marker="o", markersize=10, alpha=0.45, label="puck", **look),
@@ -202,7 +204,7 @@ class TableScene:
             Line2D([], [], marker="o", label="goal of the puck", **goal, **hollow),
         ]
         if self._subgoals is not None:
-            dots: dict[str, Any] = {"linestyle": "", "color": maps.SUBGOAL}
+            dots: style.Look = {"linestyle": "", "color": maps.SUBGOAL}
             entries.append(Line2D([], [], marker="s", label=f"{self._kind} subgoals: hand", **dots))
             entries.append(Line2D([], [], marker="o", label="and puck", **dots))
         return entries
@@ -241,7 +243,7 @@ class ImageScene:
         self._images = [
             panel.imshow(film[0]) for panel, film in zip(axes, self._films, strict=False)
         ]
-        look: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": style.TEXT}
+        look: style.Look = {"ha": "center", "va": "top", "fontsize": style.TEXT}
         self._text = figure.text(0.5, 0.93, "", color=style.INK, **look)
         self._stage = Stage(figure, [*self._images, self._text])
 
@@ -263,9 +265,9 @@ class Words:
     """
 
     def __init__(self, policy: Policy, recording: Recording, unit: float) -> None:
-        task: Any = policy.spec.task
+        task = policy.spec.task
         pair = recording.states, recording.target
-        named = task.named_distances(*pair) if getattr(task, "names", ()) else {}
+        named = task.named_distances(*pair) if isinstance(task, DistanceTask) else {}
         self._distances = named or {"": task.distance(*pair)}
         self._end = recording.length if recording.success else -1
         self._unit = unit
@@ -320,12 +322,12 @@ def _head(axes: Axes, title: str) -> None:
     axes.set_title(f"{title}\n", fontsize=style.TEXT, color=style.INK)
 
 
-def _text(axes: Axes) -> Any:
+def _text(axes: Axes) -> Text:
     """Return the words above a map."""
-    middle: dict[str, Any] = {"ha": "center", "va": "bottom", "color": style.INK}
+    middle: style.Look = {"ha": "center", "va": "bottom", "color": style.INK}
     return axes.text(0.5, 1.0, "", transform=axes.transAxes, **middle)
 
 
-def _diamonds() -> dict[str, Any]:
+def _diamonds() -> style.Look:
     look = {"color": maps.SUBGOAL, "marker": "D", "linestyle": ""}
     return {**look, "markersize": 6, "markeredgecolor": "none", "alpha": 0.7}

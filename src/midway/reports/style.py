@@ -5,9 +5,10 @@ import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -39,6 +40,9 @@ PALETTE = (BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE, BLACK)
 
 AGENT_COLOURS = {"ris": BLUE, "sac": VERMILION, "tdm": GREEN, "leap": PURPLE, "crl": SKY}
 """An agent that is named here has the same colour in every figure; others get what is left."""
+
+Look: TypeAlias = dict[str, Any]
+"""How marks, lines or words look: arguments of matplotlib."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 """Marks that tell groups apart without colour."""
@@ -89,7 +93,7 @@ def thousands(value: float | int, position: object = None) -> str:
 
 
 def figure(
-    rows: int, columns: int, height: float, width: float = WIDTH, **options: Any
+    rows: int, columns: int, height: float, width: float = WIDTH, **options: object
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure (inches) and its axes, row by row, in the style of the project."""
     drawn = Figure((width, height), layout="constrained")
@@ -128,7 +132,7 @@ def success_axis(axes: Axes) -> None:
     axes.set_yticks(np.linspace(0, 1, 5), ["0 %", "25 %", "50 %", "75 %", "100 %"])
 
 
-def legend_below(drawn: Figure, handles: Sequence[Any], title: str = "") -> None:
+def legend_below(drawn: Figure, handles: Sequence[Artist], title: str = "") -> None:
     """Put one legend under all panels; long names take several lines."""
     names = [textwrap.fill(handle.get_label(), WIDE) for handle in handles]
     columns = int(LEGEND_LETTERS * drawn.get_figwidth()) // (max(map(len, names)) + 6)

@@ -1,7 +1,6 @@
 """The table of the arm from above: where a policy brings hand and puck, and what it imagines."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -97,9 +96,9 @@ def draw_table(axes: Axes) -> None:
 
 def draw_state(axes: Axes, state: Float[np.ndarray, "4"], colour: str) -> None:
     """Draw the hand as a square, and the puck as the circle that it is."""
-    puck: Any = tuple(state[PUCK])
+    x, y = state[PUCK].tolist()
     axes.plot(*state[HAND], "s", color=colour, markersize=7, markeredgecolor="white", zorder=6)
-    axes.add_patch(Circle(puck, PUCK_RADIUS, fill=False, edgecolor=colour, lw=2, zorder=5))
+    axes.add_patch(Circle((x, y), PUCK_RADIUS, fill=False, edgecolor=colour, lw=2, zorder=5))
 
 
 def draw_ways(axes: Axes, recording: Recording) -> None:
@@ -134,8 +133,8 @@ def subgoals(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I 4"]
 
 def legend(subgoals: str) -> list[Line2D]:
     """Return the entries; ``subgoals`` are imagined, planned, or none."""
-    hollow: dict[str, Any] = {"linestyle": "", "markerfacecolor": "none", "markeredgewidth": 2}
-    dots: dict[str, Any] = {"linestyle": "", "color": maps.SUBGOAL, "markeredgecolor": style.INK}
+    hollow: style.Look = {"linestyle": "", "markerfacecolor": "none", "markeredgewidth": 2}
+    dots: style.Look = {"linestyle": "", "color": maps.SUBGOAL, "markeredgecolor": style.INK}
     entries = [
         Line2D([], [], color=maps.START, marker="s", linestyle="", label="hand at the start"),
         Line2D(

@@ -13,6 +13,7 @@ from typing import Any
 
 import glfw
 import numpy as np
+from jaxtyping import UInt8
 from OpenGL import GL
 
 
@@ -49,7 +50,7 @@ def play(window: Any, width: int, height: int, rate: int) -> None:
             return
 
 
-def draw(window: Any, frame: np.ndarray[Any, np.dtype[np.uint8]]) -> None:
+def draw(window: Any, frame: UInt8[np.ndarray, "height width 3"]) -> None:
     """Fill the window with a frame, whatever the display's scale."""
     width, height = glfw.get_framebuffer_size(window)
     GL.glViewport(0, 0, width, height)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from types import FrameType
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import jax
 import numpy as np
@@ -31,6 +31,7 @@ SNAPSHOTS = 8
 Clock: TypeAlias = dict[str, int | float]
 
 
+@runtime_checkable
 class Sinks(Protocol):
     """Where a run puts what others read: files and messages."""
 
