@@ -1,7 +1,7 @@
 """Learning curves: success and distances over environment steps and over training time."""
 
 from collections.abc import Iterator, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -265,6 +265,6 @@ def _group_entries(groups: Sequence[Group]) -> list[Line2D]:
     ]
 
 
-def _line(colour: str, label: str, line: LineStyle = "-", **look: object) -> Line2D:
+def _line(colour: str, label: str, line: LineStyle = "-", **look: Any) -> Line2D:
     """Return an entry of a legend."""
     return Line2D([], [], color=colour, linewidth=2, linestyle=line, label=label, **look)

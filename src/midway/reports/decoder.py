@@ -113,7 +113,9 @@ def decoded(
 
 def reconstructed(policy: Policy, decoder: ImageDecoder, images: Images) -> Images:
     """Return what is left of images after encoding and decoding, uint8."""
-    return decoded(decoder, _apply(encoder_of(policy), images))
+    encoder = encoder_of(policy)
+    assert encoder is not None
+    return decoded(decoder, _apply(encoder, images))
 
 
 def as_images(values: Float[np.ndarray, "B H W 3"]) -> Images:

@@ -1,6 +1,7 @@
 """Imagined subgoals during training, the subgoal chain, and the value of a goal."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -119,7 +120,7 @@ def show_image(
     shades: Float[np.ndarray, "rows columns"],
     x: Float[np.ndarray, " columns"],
     y: Float[np.ndarray, " rows"],
-    **options: object,
+    **options: Any,
 ) -> AxesImage:
     """Draw numbers at points of the plane as colours and return the image."""
     limits = axes.get_xlim(), axes.get_ylim()
@@ -169,7 +170,6 @@ def draw_values(studies: Mapping[str, Study], unit: str) -> Figure:
     x, y = grid(first.maze)
     # Values that count down to the goal end at 0.
     colours = {"cmap": "viridis", "vmin": lowest, "vmax": highest if highest > 0 else 0}
-    image: AxesImage | None = None
     for panel, (label, study) in zip(axes, studies.items(), strict=True):
         shades = tables[label]["value"].reshape(len(y), len(x))
         image = show_image(panel, first.maze, shades, x, y, **colours, zorder=1)

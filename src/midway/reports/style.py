@@ -93,7 +93,7 @@ def thousands(value: float | int, position: object = None) -> str:
 
 
 def figure(
-    rows: int, columns: int, height: float, width: float = WIDTH, **options: object
+    rows: int, columns: int, height: float, width: float = WIDTH, **options: Any
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure (inches) and its axes, row by row, in the style of the project."""
     drawn = Figure((width, height), layout="constrained")
@@ -134,7 +134,7 @@ def success_axis(axes: Axes) -> None:
 
 def legend_below(drawn: Figure, handles: Sequence[Artist], title: str = "") -> None:
     """Put one legend under all panels; long names take several lines."""
-    names = [textwrap.fill(handle.get_label(), WIDE) for handle in handles]
+    names = [textwrap.fill(str(handle.get_label()), WIDE) for handle in handles]
     columns = int(LEGEND_LETTERS * drawn.get_figwidth()) // (max(map(len, names)) + 6)
     drawn.legend(
         list(handles),
