@@ -12,6 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from midway.agents.registry import AGENTS
+
 WIDTH = 9.0
 """Width of a figure that fills a page (inches): 10-point text is still readable on a laptop."""
 
@@ -37,8 +39,8 @@ PURPLE, SKY, BLACK = "#cc79a7", "#56b4e9", "#000000"
 PALETTE = (BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE, BLACK)
 """Colours of groups of runs, in the order in which they are given out."""
 
-AGENT_COLOURS = {"ris": BLUE, "sac": VERMILION, "tdm": GREEN, "leap": PURPLE, "crl": SKY}
-"""An agent that is named here has the same colour in every figure; others get what is left."""
+AGENT_COLOURS = dict(zip(AGENTS, PALETTE, strict=False))
+"""An agent of this package has the same colour in every figure; others get what is left."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 """Marks that tell groups apart without colour."""
