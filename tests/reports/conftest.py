@@ -27,7 +27,7 @@ TINY = {
 }
 
 
-UNTRAINED = {"hidden": (8,), "num_envs": 1, "replay_capacity": 300, "random_steps": 10}
+UNTRAINED = {"hidden": (8,), "num_envs": 1, "replay_capacity": 400, "random_steps": 10}
 EVALUATED = (
     "step,updates,seconds,training_seconds,task,actions,episodes,success_rate,final_distance"
 )
