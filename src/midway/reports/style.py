@@ -23,6 +23,9 @@ RESOLUTION = 150
 NARROW, WIDE = 30, 44
 """Letters in a line of a panel's title and of a legend's entry, at most."""
 
+TITLE_LETTERS = 11.0
+"""Letters of a title in an inch."""
+
 LEGEND_LETTERS = 16.0
 """Letters of a legend in an inch."""
 
@@ -119,8 +122,12 @@ def label(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
 
 
 def caption(axes: Axes, *lines: str) -> None:
-    """Write a title in the middle, for panels that look alike."""
-    wrapped = [textwrap.fill(line, NARROW) for line in lines]
+    """Write a title in the middle, for panels that look alike, as wide as a column of them."""
+    place, figure = axes.get_subplotspec(), axes.get_figure(root=True)
+    columns = place.get_gridspec().ncols if place else 1
+    width = figure.get_figwidth() if figure else WIDTH
+    letters = min(NARROW, int(TITLE_LETTERS * width / columns))
+    wrapped = [textwrap.fill(line, letters) for line in lines]
     axes.set_title("\n".join(wrapped), fontsize=TEXT, color=INK)
 
 
