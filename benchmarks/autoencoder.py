@@ -12,10 +12,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from midway.training.folder import RunFolder
-
-from midway.training import api
-from midway.training.progress import Silent
+from midway import api
+from midway.runs.folder import RunFolder
+from midway.training import state as states
 
 RESULTS = Path(__file__).parent / "results" / "autoencoder"
 WEIGHTS = (1e-4, 1e-2)
@@ -43,7 +42,7 @@ def measure(env: str, weight: float, random_actions: int) -> dict[str, Any]:
     config = api.configure(env, "leap", changes=changes)
     with tempfile.TemporaryDirectory() as name:
         folder = RunFolder(Path(name))
-        api.build(config, folder).pretrain(Silent())
+        states.start(api.setup_of(config, folder), print)
         with (folder.path / "pretraining.csv").open() as file:
             last = list(csv.DictReader(file))[-1]
     found = {

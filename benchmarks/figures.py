@@ -12,9 +12,13 @@ import shutil
 import sys
 import tempfile
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
-from midway.reports import report
+from midway.reports import compose, curves, style
+from midway.reports.cache import Cache
+from midway.reports.runs import by_environment, read
+from midway.reports.style import Picture
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
@@ -89,12 +93,20 @@ def main() -> None:
     runs = sorted(path for pattern in source.runs for path in folder.glob(pattern) if path.is_dir())
     if not runs:
         sys.exit(f"no runs like {', '.join(source.runs)} in {folder}: see benchmarks/README.md")
-    with tempfile.TemporaryDirectory() as drawn:
-        report(runs, Path(drawn))
-        file = Path(drawn) / f"{source.file}.png"
-        if not file.exists():
+    with tempfile.TemporaryDirectory() as folder:
+        picture = find(source.file, runs, Path(folder))
+        if picture is None:
             sys.exit(f"these runs have no {source.file}: see what their report says is missing")
-        print(shutil.copy(file, HERE.parent / source.out))
+        files = style.save(picture.draw(), Path(folder) / picture.stem)
+        print(shutil.copy(files[0], HERE.parent / source.out))
+
+
+def find(stem: str, runs: list[Path], tables: Path) -> Picture | None:
+    """Return the figure of this name in the report of these runs; nothing else is drawn."""
+    environments = by_environment([read(path) for path in runs])
+    of_each = (compose.pictures(one, Cache(tables)) for one in environments)
+    pictures = chain(curves.overview(environments), *of_each)
+    return next((picture for picture in pictures if picture.stem == stem), None)
 
 
 if __name__ == "__main__":

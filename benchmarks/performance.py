@@ -22,9 +22,9 @@ import equinox as eqx
 import jax
 
 from midway.agents import ris
+from midway.bench import pieces as measures
+from midway.bench import plan as bench_plan
 from midway.replay import buffer
-from midway.training import bench as measures
-from midway.training import bench_plan
 
 RESULTS = Path(__file__).parent / "results" / "speed" / "midway.json"
 ONE_CORE = ("taskset", "--cpu-list", "0")
@@ -85,21 +85,21 @@ def memory(env: str) -> dict[str, Any]:
 def split(batch: int) -> dict[str, Any]:
     """Return how long the parts of one update of RIS take, each compiled alone (ms)."""
     training = measures.filled("ant-u", "ris", batch, "bf16", updates_per_call=1)
-    state, spec, mix = training.state, training.spec, training.config.train.relabel
+    state, spec, mix = training.state, training.program.spec, training.setup.train.relabel
     key = jax.random.key(0)
     sample = jax.jit(lambda replay: buffer.sample(replay, spec, mix, batch, key))
     drawn = sample(training.replay)
     critics = eqx.filter_jit(ris.update_critic)
     subgoal_policy = eqx.filter_jit(ris.update_subgoal_policy)
     policy = eqx.filter_jit(ris.update_policy)
-    copies = eqx.filter_jit(ris.update_copies)
+    targets = eqx.filter_jit(ris.update_targets)
     times = measures.medians(
         {
             "sample": lambda: sample(training.replay),
             "critics": lambda: arrays(critics(state, drawn.observation, drawn, key)),
             "subgoal_policy": lambda: arrays(subgoal_policy(state, drawn)),
             "policy": lambda: arrays(policy(state, drawn, key, key)),
-            "copies": lambda: arrays(copies(state)),
+            "targets": lambda: arrays(targets(state)),
         }
     )
     return {"batch": batch, **times}

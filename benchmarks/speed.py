@@ -22,8 +22,7 @@ import jax
 import torch
 from stable_baselines3 import SAC, HerReplayBuffer
 
-import midway
-from midway.training import bench
+from midway.bench import pieces as bench
 
 BATCHES = (256, 2048)
 UPDATES = 8
@@ -86,7 +85,7 @@ def ours(batch: int, precision: str) -> Callable[[], None]:
     training = bench.filled("ant-u", "sac", batch, precision, updates_per_call=UPDATES)
 
     def update() -> None:
-        training.arrays, training.totals = training.learner.train(
+        training.arrays, training.totals = training.program.train(
             training.arrays, training.totals, training.replay, jax.random.key(0), 0
         )
         jax.block_until_ready(training.totals)
@@ -100,7 +99,7 @@ def theirs(batch: int) -> Callable[[], None]:
 
     model = SAC(
         "MultiInputPolicy",
-        gymnasium.make(midway.envs.ids.GYM_IDS["ant-u"]),
+        gymnasium.make("midway/AntMaze-U-v0"),
         replay_buffer_class=HerReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
         policy_kwargs={"net_arch": [256, 256]},

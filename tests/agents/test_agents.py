@@ -11,7 +11,7 @@ import pytest
 
 from midway import functional
 from midway.agent import Agent
-from midway.agents import leap, registry, ris, sac, tdm
+from midway.agents import beyond, leap, registry, ris, sac, tdm
 from midway.types import ConfigurationError, Subgoal
 
 KEY = jax.random.key(7)
@@ -115,7 +115,7 @@ def test_defaults_are_table_1_for_ant_navigation():
         "num_subgoals": 10,
         "epsilon": 1e-16,
         "precision": "f32",
-    }
+    } | vars(beyond.SubgoalSettings()) | {"normalise": False}
     assert functional.value_bound(ris.Config().discount) == pytest.approx(100)
     shared = vars(sac.Config()).items() & vars(ris.Config()).items()
     assert len(shared) == len(vars(sac.Config())) - 1  # all but the entropy's learning rate

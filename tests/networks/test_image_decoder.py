@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from midway.training.decoder import fit_to
 
 from midway.networks.decoder import ImageDecoder, loss
+from midway.reports.decoder import fit_to
 
 KEY = jax.random.key(0)
 

@@ -27,7 +27,7 @@ TINY = {
 }
 
 
-UNTRAINED = {"hidden": (8,), "num_envs": 1, "replay_capacity": 300, "random_steps": 10}
+UNTRAINED = {"hidden": (8,), "num_envs": 1, "replay_capacity": 400, "random_steps": 10}
 EVALUATED = (
     "step,updates,seconds,training_seconds,task,actions,episodes,success_rate,final_distance"
 )
@@ -99,6 +99,7 @@ def quick_decoder(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def leap_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a run of an agent that plans, whose plans take no time."""
-    small = {"num_subgoals": 3, "plan_samples": 16, "plan_iterations": 2}
+    """Return a run of an agent that plans, whose autoencoder and plans take no time."""
+    plans = {"num_subgoals": 3, "plan_samples": 16, "plan_iterations": 2}
+    small = {**plans, "vae_states": 200, "vae_rounds": 1, "vae_updates": 2}
     return untrained(tmp_path_factory.mktemp("runs") / "leap", "point-u", "leap", small)

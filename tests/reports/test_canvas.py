@@ -32,7 +32,7 @@ def test_mazes(ris_run, sac_run, leap_run, copy_run, tmp_path):
     for name in ("config.json", "policy.json"):
         file = other / name
         file.write_text(file.read_text().replace("point-u", "point-s"))
-    assert check([ris_run, sac_run, leap_run, other], tmp_path) == 1 + 10 + 6
+    assert check([ris_run, sac_run, leap_run, other], tmp_path) == 1 + 11 + 6
 
 
 def test_a_table(state_run, tmp_path):

@@ -12,7 +12,7 @@ import pytest
 from midway.envs.mazes import MAZES
 from midway.envs.registry import entry
 from midway.envs.views import MazeView
-from midway.reports import cache, compose, maze, report
+from midway.reports import cache, compose, images, maze, report
 from midway.reports.cache import Episode, Study, is_flipped
 from midway.reports.curves import success_curve
 from midway.reports.difficulty import bins
@@ -226,3 +226,12 @@ def test_every_panel_says_what_is_healthy():
 
 def test_reports_leave_the_run_as_it_is(ris_run, single):
     assert not (Path(ris_run) / "figures").exists()
+
+
+def test_what_the_autoencoder_keeps_is_drawn(leap_run, tmp_path):
+    looked = Study(compose.read(leap_run), tmp_path)
+    states, kept = images.reconstructions(looked.policy)
+    assert states.shape == kept.shape == (images.STATES, 4)
+    error = np.linalg.norm((states - kept)[:, :2], axis=1).mean()
+    title = images.draw_reconstructions(looked, "LEAP").axes[0].get_title()
+    assert f"mean error {error:.2f} m" in title.replace("\n", " ")

@@ -8,7 +8,7 @@ from midway.training import state
 
 def save_untrained(folder: RunFolder, config: RunConfig, steps: int) -> None:
     """Make a run folder with the policy of an agent that has learned nothing."""
+    folder.create(config)
     training = state.start(api.setup_of(config, folder))
     training.counters = training.counters._replace(steps=steps)
-    folder.create(config)
     policy.save(folder, config, training)

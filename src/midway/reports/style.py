@@ -13,6 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from midway.agents.registry import AGENTS
+
 WIDTH = 9.0
 """Width of a figure that fills a page (inches): 10-point text is still readable on a laptop."""
 
@@ -21,6 +23,9 @@ RESOLUTION = 150
 
 NARROW, WIDE = 30, 44
 """Letters in a line of a panel's title and of a legend's entry, at most."""
+
+TITLE_LETTERS = 11.0
+"""Letters of a title in an inch."""
 
 LEGEND_LETTERS = 16.0
 """Letters of a legend in an inch."""
@@ -38,8 +43,8 @@ PURPLE, SKY, BLACK = "#cc79a7", "#56b4e9", "#000000"
 PALETTE = (BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE, BLACK)
 """Colours of groups of runs, in the order in which they are given out."""
 
-AGENT_COLOURS = {"ris": BLUE, "sac": VERMILION, "tdm": GREEN, "leap": PURPLE, "crl": SKY}
-"""An agent that is named here has the same colour in every figure; others get what is left."""
+AGENT_COLOURS = dict(zip(AGENTS, PALETTE, strict=False))
+"""An agent of this package has the same colour in every figure; others get what is left."""
 
 Look: TypeAlias = dict[str, Any]
 """How marks, lines or words look: arguments of matplotlib."""
@@ -121,8 +126,12 @@ def label(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
 
 
 def caption(axes: Axes, *lines: str) -> None:
-    """Write a title in the middle, for panels that look alike."""
-    wrapped = [textwrap.fill(line, NARROW) for line in lines]
+    """Write a title in the middle, for panels that look alike, as wide as a column of them."""
+    place, figure = axes.get_subplotspec(), axes.get_figure(root=True)
+    columns = place.get_gridspec().ncols if place else 1
+    width = figure.get_figwidth() if figure else WIDTH
+    letters = min(NARROW, int(TITLE_LETTERS * width / columns))
+    wrapped = [textwrap.fill(line, letters) for line in lines]
     axes.set_title("\n".join(wrapped), fontsize=TEXT, color=INK)
 
 

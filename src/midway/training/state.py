@@ -154,7 +154,7 @@ def _begin(
     program, arrays = _compiled(setup, state)
     replay = devices.allocate(allocate)
     totals = step.empty_totals(setup.agent, program, arrays, train, replay)
-    streams = devices.copied(seeds.training(setup.seed))
+    streams = _streams(setup)
     collector, replay = Collector.start(env, replay, streams.env)
     collector.limit = train.collect_limit
     parts = (program, arrays, devices.copied(totals), replay, (), collector, streams)
@@ -167,9 +167,20 @@ def _devices(setup: Setup) -> Devices:
     return Devices.first(setup.train.devices)
 
 
+def _streams(setup: Setup) -> seeds.Streams:
+    """Return the run's streams with their keys on its devices."""
+    streams, devices = seeds.training(setup.seed), _devices(setup)
+    return streams._replace(
+        network_key=devices.copied(streams.network_key),
+        update_key=devices.copied(streams.update_key),
+        act_key=devices.copied(streams.act_key),
+        evaluation_key=devices.copied(streams.evaluation_key),
+    )
+
+
 def _create(setup: Setup, spec: EnvSpec) -> AgentState:
     """Return the agent's state at its start."""
-    key = _devices(setup).copied(seeds.training(setup.seed)).network_key
+    key = _streams(setup).network_key
     return step.create_state(setup.agent, setup.hyperparameters, spec, key)
 
 
