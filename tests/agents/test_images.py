@@ -87,7 +87,7 @@ def test_the_encoder_is_trained_by_the_critics_loss_of_the_current_image_alone(n
 def test_candidates_are_the_features_of_other_observations():
     _, state = made("ris")
     features = state.encoder(drawn().observation)
-    candidate = ris.subgoal_candidates(state.encoder, drawn(), features)
+    candidate = encoders.candidates(state.encoder, drawn(), features)
     np.testing.assert_array_equal(candidate.observation[1:], features[:-1])
     np.testing.assert_array_equal(candidate.observation[0], features[-1])
     np.testing.assert_array_equal(candidate.achieved_goal, candidate.observation)
