@@ -47,7 +47,7 @@ class State(eqx.Module):
 
 def create(config, spec, key):
     """Return networks at their random start, for the sizes that the specification gives."""
-    encoder = encoders.create(spec, config, key)
+    encoder = StateEncoder(spec.origin, spec.unit)
     inputs = sum(encoders.feature_sizes(spec))
     policy = GaussianPolicy(inputs, spec.action_dim, config.hidden, "f32", key=key)
     return State(encoder, policy, optimizer.init(policy), config, spec)

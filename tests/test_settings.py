@@ -210,6 +210,8 @@ def values_of(config: Any) -> st.SearchStrategy[dict[str, Any]]:
     def of(value: Any, allowed: Allowed) -> st.SearchStrategy[Any]:
         if allowed.choices:
             return st.sampled_from(allowed.choices)
+        if isinstance(value, bool):
+            return st.booleans()
         if isinstance(value, tuple):
             return st.lists(of(value[0], allowed), max_size=4).map(tuple)
         if isinstance(value, int):

@@ -26,7 +26,7 @@ def td_target(
     return reward + discount * (1 - terminated) * next_value
 
 
-def critic_loss(q: Float[Array, "2 B"], target: Float[Array, " B"]) -> Float[Array, ""]:
+def critic_loss(q: Float[Array, "#2 B"], target: Float[Array, " B"]) -> Float[Array, ""]:
     """Return half the squared error, summed over the critics, averaged over the batch."""
     return 0.5 * ((q - target) ** 2).sum(0).mean()
 

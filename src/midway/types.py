@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import Field, asdict, dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
@@ -14,10 +14,8 @@ NumPyArray: TypeAlias = np.ndarray[Any, np.dtype[Any]]
 AnyArray: TypeAlias = NumPyArray | Array
 """What is taken by compiled functions."""
 
-OneArray = TypeVar("OneArray", NumPyArray, Array)
-"""NumPy or JAX arrays: the goal task is written for both, and gives what it is given."""
-
 ArrayLike: TypeAlias = Any
+"""A NumPy or JAX array, or a scalar of one: the goal task gives what it is given."""
 
 Observation: TypeAlias = Mapping[str, AnyArray]
 """Goal-environment dictionary: observation, achieved_goal, desired_goal (and the two states)."""
@@ -57,11 +55,11 @@ class NonFiniteError(RuntimeError):
 class GoalTask(Protocol):
     """The one definition of success, shared by collection, replay, evaluation and tests."""
 
-    def __call__(self, achieved: OneArray, desired: OneArray) -> tuple[OneArray, OneArray]:
+    def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
         """Return reward ``(B,)`` float32, terminated ``(B,)`` bool for goals ``(B, goal_dim)``."""
         ...
 
-    def distance(self, achieved: OneArray, desired: OneArray) -> OneArray:
+    def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
         """Return the distance to the goal ``(B,)`` that success is measured by."""
         ...
 
@@ -81,25 +79,25 @@ class DistanceTask:
     threshold: float
     names: tuple[str, ...] = ()
 
-    def distance(self, achieved: OneArray, desired: OneArray) -> OneArray:
+    def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
         """Return the largest of the groups' distances ``(B,)`` (m)."""
         largest, *others = self._distances(achieved, desired)
         for other in others:
             largest = largest * (largest >= other) + other * (other > largest)
         return largest
 
-    def named_distances(self, achieved: OneArray, desired: OneArray) -> dict[str, OneArray]:
+    def named_distances(self, achieved: ArrayLike, desired: ArrayLike) -> dict[str, ArrayLike]:
         """Return the distance of each group ``(B,)`` by its name (m); nothing without names."""
         return dict(zip(self.names, self._distances(achieved, desired), strict=False))
 
-    def _distances(self, achieved: OneArray, desired: OneArray) -> list[OneArray]:
+    def _distances(self, achieved: ArrayLike, desired: ArrayLike) -> list[ArrayLike]:
         difference = achieved - desired
         return [
             sum(difference[..., i] ** 2 for i in group) ** 0.5  # type: ignore[operator]
             for group in self.groups
         ]
 
-    def __call__(self, achieved: OneArray, desired: OneArray) -> tuple[OneArray, OneArray]:
+    def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
         """Return reward ``(B,)``, always -1, and terminated ``(B,)``."""
         distance = self.distance(achieved, desired)
         return (0 * distance - 1).astype("float32"), distance < self.threshold
@@ -109,11 +107,11 @@ class DistanceTask:
 class UnknownTask:
     """Success of an environment whose rule is not stored with the policy."""
 
-    def distance(self, achieved: OneArray, desired: OneArray) -> OneArray:
+    def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
         """Raise a ConfigurationError: only the environment itself can tell."""
         raise ConfigurationError("what counts as reached is known to the environment alone")
 
-    def __call__(self, achieved: OneArray, desired: OneArray) -> tuple[OneArray, OneArray]:
+    def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
         """Raise a ConfigurationError, as ``distance``."""
         distance = self.distance(achieved, desired)
         return distance, distance

@@ -178,7 +178,7 @@ def test_roles_of_a_subgoal_are_split_and_joined(ris_case):
     vector = encoders.as_vector(ris_case.spec, candidate)
     sizes = ris_case.spec.observation_shape[0], ris_case.spec.goal_shape[0]
     assert vector.shape[1] == (sizes[0] if ris_case.spec.goal_is_observation else sum(sizes))
-    for ours, expected in zip(ris.as_subgoal(ris_case.spec, vector), candidate, strict=True):
+    for ours, expected in zip(encoders.as_subgoal(ris_case.spec, vector), candidate, strict=True):
         np.testing.assert_array_equal(ours, expected)
 
 

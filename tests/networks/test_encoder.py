@@ -22,6 +22,7 @@ class Config:
 
     random_shift: int = 8
     image_pooling: int = 1
+    normalise: bool = False
     precision: Precision = "f32"
 
 

@@ -132,6 +132,8 @@ class Line:
     """One-dimensional walk for evaluation: each starts as far away as its number says."""
 
     tasks = ("near",)
+    goal_spec, resumable, logged_info = None, False, {}
+    state_dict = load_state_dict = None
 
     def __init__(self, num_envs: int) -> None:
         self.num_envs = num_envs

@@ -7,7 +7,7 @@ import numpy as np
 
 from midway.envs.registry import make_vec
 from midway.envs.vector import Array
-from midway.types import ConfigurationError, Info, Observations, Options
+from midway.types import ArrayLike, ConfigurationError, Info, Observations, Options
 
 Scalars: TypeAlias = dict[str, float | int]
 """Info of one environment."""
@@ -70,7 +70,7 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
             _first_info(info),
         )
 
-    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: object) -> Array:
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: object) -> ArrayLike:
         """Return the reward of goals ``(goal_dim,)`` or ``(n, goal_dim)``; info is not used.
 
         Where goals are images, give ``achieved_state`` and ``desired_state`` in their place.
@@ -80,7 +80,9 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
         """
         return self._outcome(achieved_goal, desired_goal)[0]
 
-    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: object) -> Array:
+    def compute_terminated(
+        self, achieved_goal: Array, desired_goal: Array, info: object
+    ) -> ArrayLike:
         """Return whether the goal is reached; goals and errors as of ``compute_reward``."""
         return self._outcome(achieved_goal, desired_goal)[1]
 
@@ -88,7 +90,7 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
         """Return whether ``info`` is of the last step that an episode may have."""
         return bool(info["elapsed_steps"] >= self.goal_spec.max_episode_steps)
 
-    def _outcome(self, achieved: Array, desired: Array) -> tuple[Array, Array]:
+    def _outcome(self, achieved: Array, desired: Array) -> tuple[ArrayLike, ArrayLike]:
         shape = self.goal_spec.state_shape
         if shape is not None and np.shape(achieved)[-1:] + np.shape(desired)[-1:] != shape * 2:
             raise ConfigurationError(

@@ -120,7 +120,8 @@ def sample(
     def is_reached(
         lane: Int[Array, " B"], position: Int[Array, " B"], desired: Shaped[Array, "B ..."]
     ) -> Bool[Array, " B"]:
-        return spec.task(read(replay, truth, lane, position), desired)[1]
+        reached: Bool[Array, " B"] = spec.task(read(replay, truth, lane, position), desired)[1]
+        return reached
 
     current, candidate = (pairs.lane, pairs.position), (others.lane, others.position)
     goal, ahead = goal_rows(pairs, states, mix, goal_key)

@@ -8,7 +8,7 @@ while features moved would keep a policy whose spread can sit at its clip, witho
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -16,12 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from midway.agent import AgentState, AnyAgent, Encoder
+from midway.agent import AnyAgent, Encoder
 from midway.replay.storage import ReplayState
 from midway.training.devices import compile_by_lane
 from midway.types import EnvSpec, Info, NumPyArray, Observations, Options, Step, VectorGoalEnv
 
 Encode = Callable[[UInt8[NumPyArray, "B H W 3"]], Float[Array, "B F"]]
+
+
+State = TypeVar("State")
 
 
 def encoded_spec(spec: EnvSpec, encoder: Encoder) -> EnvSpec:
@@ -38,10 +41,10 @@ def encoded_replay(replay: ReplayState, encoder: Encoder) -> ReplayState:
     return replay._replace(rows={**replay.rows, "observation": features})
 
 
-def keep(agent: AnyAgent, fresh: AgentState, state: AgentState) -> AgentState:
+def keep(agent: AnyAgent, fresh: State, state: State) -> State:
     """Return the agent created for the features with what it takes over from that of images."""
     kept = agent.freezing.kept if agent.freezing else ()
-    return replace(fresh, **{name: getattr(state, name) for name in kept})
+    return cast(State, replace(cast(Any, fresh), **{name: getattr(state, name) for name in kept}))
 
 
 def thawed(env: VectorGoalEnv) -> VectorGoalEnv:

@@ -1,0 +1,172 @@
+"""Beyond the paper: targets, candidates, inputs and delayed steps, against NumPy by hand."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from midway.agents import beyond, ris, sac
+from midway.networks import inputs, optimizer
+from midway.networks.mlp import normalised
+from midway.types import Batch, DistanceTask, EnvSpec, Subgoal
+
+TASK = DistanceTask(((0, 1),), 0.5)
+SPEC = EnvSpec("states", (4,), "float32", (4,), 2, 50, True, None, TASK)
+KEY = jax.random.key(0)
+
+FAST = {
+    "n_step": 3,
+    "clip_targets": True,
+    "hindsight_bound": True,
+    "unreached_goals": True,
+    "num_critics": 1,
+    "layer_norm": True,
+    "goal_inputs": "relative",
+    "policy_every": 2,
+}
+
+
+def batch(size: int = 8, **others: object) -> Batch:
+    rng = np.random.default_rng(0)
+
+    def normal(*shape: int) -> jax.Array:
+        return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+    drawn = Batch(
+        observation=normal(size, 4),
+        action=jnp.tanh(normal(size, 2)),
+        reward=-jnp.ones(size),
+        terminated=jnp.arange(size) == 0,
+        next_observation=normal(size, 4),
+        goal=normal(size, 4),
+        subgoal_candidate=Subgoal(normal(size, 4), normal(size, 4)),
+        steps=jnp.full(size, 3.0),
+        reached_in=jnp.full(size, 10.0**6),
+        between=normal(size, 4),
+    )
+    return drawn._replace(**others)
+
+
+def test_targets_of_n_steps_by_hand():
+    drawn = batch(4, steps=jnp.array([1.0, 2.0, 3.0, 3.0]), terminated=jnp.arange(4) == 3)
+    target = beyond.n_step_target(drawn, jnp.full(4, -10.0), sac.Config(discount=0.5))
+    # 1, 1.5 and 1.75 discounted steps, then 0.5^n of -10; nothing after the goal
+    np.testing.assert_allclose(target, [-6, -4, -3, -1.75])
+
+
+def test_targets_of_one_step_are_those_of_the_paper():
+    drawn = batch(4, steps=None, reached_in=None)
+    value = jnp.array([-1.0, -2.0, -3.0, -4.0])
+    found = beyond.n_step_target(drawn, value, sac.Config())
+    np.testing.assert_array_equal(found, -1 + 0.99 * np.array([0, -2, -3, -4], np.float32))
+
+
+def test_the_way_of_the_episode_bounds_targets_from_below():
+    config = sac.Config(discount=0.5, hindsight_bound=True)
+    drawn = batch(4, steps=jnp.ones(4), terminated=jnp.zeros(4, bool))
+    drawn = drawn._replace(reached_in=jnp.array([2.0, 10.0**6, 1.0, 3.0]))
+    target = beyond.n_step_target(drawn, jnp.full(4, -9.0), config)
+    np.testing.assert_allclose(target, [-1.5, -2, -1, -1.75])
+
+
+def test_targets_are_clipped():
+    config = sac.Config(discount=0.5, clip_targets=True)
+    drawn = batch(2, steps=jnp.ones(2), terminated=jnp.zeros(2, bool))
+    target = beyond.n_step_target(drawn, jnp.array([50.0, -50.0]), config)
+    np.testing.assert_allclose(target, [0, -2])
+
+
+def test_relative_inputs_by_hand():
+    read = inputs.create(SPEC, "relative", 1.0)
+    state, goal = jnp.array([[1.0, 1.0, 7.0, 7.0]]), jnp.array([[4.0, 5.0, 9.0, 9.0]])
+    seen, told = read(state, goal)
+    np.testing.assert_array_equal(seen, state)
+    wanted = [4, 5, 3, 4, 3 / 5.5, 4 / 5.5, np.log(5.25)]
+    np.testing.assert_allclose(told[0], wanted, rtol=1e-5)
+    assert told.shape[-1] == read.size(4)
+
+
+def test_inputs_of_one_state_and_many_goals_are_broadcast():
+    read = inputs.create(SPEC, "relative", 1.0)
+    _, told = read(jnp.zeros((3, 1, 4)), jnp.ones((3, 5, 4)))
+    assert told.shape == (3, 5, 7)
+
+
+def test_a_subgoal_of_coordinates_is_a_state_at_that_place():
+    read = inputs.create(SPEC, "coordinates", 1.0)
+    state = jnp.array([[1.0, 2.0, 3.0, 4.0]])
+    found = read.embed(state, jnp.array([[8.0, 9.0]]))
+    np.testing.assert_array_equal(found, [[8, 9, 3, 4]])
+    np.testing.assert_array_equal(read.pick(found), [[8, 9]])
+
+
+def test_goals_that_are_no_observations_are_read_whole():
+    pairs = replace(SPEC, observation_shape=(6,), goal_shape=(2,), goal_is_observation=False)
+    assert inputs.create(pairs, "relative", 1.0).size(2) == 2
+
+
+def test_normalised_layers_have_mean_0_and_variance_1():
+    x = normalised(jnp.asarray(np.random.default_rng(0).normal(3, 5, (7, 64)), jnp.float32))
+    np.testing.assert_allclose(x.mean(-1), 0, atol=1e-5)
+    np.testing.assert_allclose(x.var(-1), 1, rtol=1e-3)
+
+
+def test_candidates_begin_with_the_state_in_between():
+    drawn = batch(8)
+    few, candidates = beyond.candidates_of_each_pair(drawn, 3, 4)
+    assert candidates.shape == (4, 3, 4)
+    np.testing.assert_array_equal(few.goal, drawn.goal[::2])
+    np.testing.assert_array_equal(candidates[:, 0], drawn.between[::2])
+    own = np.arange(0, 8, 2)
+    assert not (candidates[:, 1] == drawn.subgoal_candidate.observation[own]).all(-1).any()
+
+
+def test_cheap_candidates_weigh_more():
+    weight = beyond.candidate_weights(jnp.array([[1.0, 3.0], [2.0, 2.0]]), 2.0)
+    first = 1 / (1 + np.exp(-1))
+    np.testing.assert_allclose(weight, [[first, 1 - first], [0.5, 0.5]], rtol=1e-5)
+
+
+def test_the_subgoal_policy_comes_to_the_cheapest_candidate():
+    config = ris.Config(
+        hidden=(16,), subgoal_learning_rate=0.02, candidates_per_pair=4, candidate_pairs=4
+    )
+    state = ris.create(config, SPEC, KEY)
+    drawn = batch(16)
+    best = drawn.between
+
+    def cost_of(rows: Batch, subgoal: Subgoal) -> jax.Array:
+        near = jnp.abs(subgoal.observation[:, None] - best[None]).sum(-1).min(1)
+        return 100 * near
+
+    def loss(policy: object) -> jax.Array:
+        return beyond.candidate_loss(policy, cost_of, drawn, SPEC, config)[0]
+
+    policy, adam = state.subgoal_policy, state.subgoal_optimizer
+    first = loss(policy)
+    for _ in range(100):
+        policy, adam, _ = optimizer.minimise(
+            lambda p: beyond.candidate_loss(p, cost_of, drawn, SPEC, config), policy, adam, 0.02
+        )
+    assert loss(policy) < first - 1
+
+
+@pytest.mark.parametrize("module", [ris, sac])
+def test_delayed_policies_step_in_every_second_update(module):
+    extra = {"candidates_per_pair": 4, "subgoal_every": 2} if module is ris else {}
+    config = module.Config(hidden=(8,), **FAST, **extra)
+    state = module.create(config, SPEC, KEY)
+    compiled = eqx.filter_jit(module.update)
+    first, _ = compiled(state, batch(8), KEY)
+    second, metrics = compiled(first, batch(8), KEY)
+
+    def same(a: object, b: object) -> bool:
+        return bool(eqx.tree_equal(eqx.filter(a, eqx.is_array), eqx.filter(b, eqx.is_array)))
+
+    assert not same(first.policy, state.policy)
+    assert same(second.policy, first.policy)
+    assert not same(second.critic, first.critic)
+    assert all(np.isfinite(float(value)) for value in metrics.values())

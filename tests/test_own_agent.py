@@ -1,0 +1,81 @@
+"""An agent from outside the package is used exactly as one from inside (examples/gcbc.py)."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import midway
+from midway.agents import registry
+from midway.types import ConfigurationError
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+SMALL = {
+    "hidden": (16, 16),
+    "batch_size": 16,
+    "num_envs": 4,
+    "random_steps": 40,
+    "replay_capacity": 2_000,
+    "evaluate_every": 200,
+    "evaluation_episodes": 2,
+    "log_every": 100,
+    "checkpoint_every": 100,
+}
+
+
+def cli(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line in a process of its own that finds the example."""
+    environment = {**os.environ, "PYTHONPATH": str(EXAMPLES)}
+    command = [sys.executable, "-m", "midway.cli", *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_the_example_is_short() -> None:
+    assert len((EXAMPLES / "gcbc.py").read_text().splitlines()) < 120
+
+
+def test_from_the_command_line_to_the_report(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    changes = [f"{name}={value}".replace(" ", "") for name, value in SMALL.items()]
+    train = ["train", "point-u", "--agent", "gcbc:AGENT", "--steps", "200", "--out", str(run)]
+    done = cli(*train, "--set", *changes)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((run / "config.json").read_text())["agent"] == "gcbc:AGENT"
+    assert cli("resume", str(run), "--steps", "300").returncode == 0
+    found = cli("evaluate", str(run), "--episodes", "3", "--task", "uniform", "--json")
+    assert len(json.loads(found.stdout)["episodes"]) == 3
+    drawn = cli("report", str(run))
+    assert drawn.returncode == 0, drawn.stderr
+    assert (run / "figures" / "report.html").exists()
+    video = cli("watch", str(run), "--out", str(tmp_path / "video.gif"))
+    assert video.returncode == 0, video.stderr
+
+
+def test_an_agent_itself_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    from gcbc import AGENT  # type: ignore[import-not-found]
+
+    changes = SMALL | {"steps": 100}
+    run = midway.train("point-u", agent=AGENT, out=tmp_path / "run", changes=changes)
+    assert run.finished
+    policy = midway.load(run.path)
+    assert policy.agent is AGENT
+    assert registry.name_of(AGENT) == "gcbc:AGENT"
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("dqn", "choose one of ris"),
+        ("no_such_module:AGENT", "no_such_module"),
+        ("math:pi", "not a midway Agent"),
+        ("math:nothing", "nothing"),
+    ],
+)
+def test_what_is_no_agent_is_refused_in_one_line(name: str, said: str) -> None:
+    with pytest.raises(ConfigurationError, match=said) as error:
+        registry.get(name)
+    assert "\n" not in str(error.value)
