@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import pytest
 from untrained import save_untrained
 
 from midway import api
-from midway.reports import decoder
+from midway.reports import cache, decoder
 from midway.runs.folder import RunFolder
 
 TINY = {
@@ -36,6 +36,14 @@ EVALUATED += ",episode_length,final_distance_hand,final_distance_puck"
 
 def train(out: Path, agent: str) -> Path:
     return api.train("point-u", agent=agent, steps=1_200, out=out, changes=TINY).path
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_episodes() -> Iterator[None]:
+    """Record 20 uniform episodes in a maze instead of 200."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "STEPS", 1)
+        yield
 
 
 @pytest.fixture(scope="session")

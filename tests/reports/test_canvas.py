@@ -56,7 +56,10 @@ def test_maps_with_long_names(name, columns):
 
 
 def test_words_that_are_cut_off_are_found():
-    figure, (axes,) = style.figure(1, 1, height=2, width=2)
-    style.label(axes, "a title that is much too long for its panel", "x", "y")
+    figure, (axes,) = style.figure(1, 1, height=3, width=4)
+    style.label(axes, "title", "x", "y")
+    figure.text(0.9, 0.5, "words at the edge")
     style.settle(figure)
-    assert cut_off(figure) == ["a title that is much too long for its panel"]
+    assert cut_off(figure) == ["words at the edge"]
+    axes.set_title("far above", y=2.0)
+    assert cut_off(figure) == ["words at the edge", "far above"]

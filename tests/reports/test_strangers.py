@@ -76,7 +76,7 @@ def test_an_environment_without_a_view_has_curves_and_health(
 
 def test_values_of_a_run_are_text_on_the_page(sac_run, copy_run, tmp_path):
     attack = "<script>alert(1)</script>"
-    run = renamed(copy_run(sac_run, "attack"), seed=attack, command=attack, versions=attack)
+    run = renamed(copy_run(sac_run, "attack"), preset=attack, command=attack, versions=attack)
     text = report([run], tmp_path / "out")[0].read_text()
     assert "<script" not in text
     assert "&lt;script&gt;" in text

@@ -58,7 +58,7 @@ class StateEncoder(eqx.Module):
     unit: float | tuple[float, ...] = eqx.field(static=True)
     bound: float = eqx.field(static=True, default=math.inf)
 
-    def __call__(self, observation: Float[Array, "B S"]) -> Float[Array, "B S"]:
+    def __call__(self, observation: Float[Array, "*B S"]) -> Float[Array, "*B S"]:
         """Return (state - origin) / unit, within ± bound."""
         features = (observation - self._shift) / self._unit
         return features if math.isinf(self.bound) else jnp.clip(features, -self.bound, self.bound)
