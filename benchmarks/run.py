@@ -33,11 +33,15 @@ SUITES: dict[str, list[Job]] = {
         for seed in SEEDS
     ],
     "point-u-agents": [
-        Job("point-u", agent, seed) for agent in ("tdm", "leap") for seed in range(3)
+        Job("point-u", agent, seed) for agent in ("tdm", "leap", "crl") for seed in range(3)
     ],
     "push-state": [Job("push-state", agent, 0) for agent in ("ris", "sac")],
     "push": [Job("push", "ris", 0)],
     "precision": [Job("point-u", "ris", seed, F32, "f32") for seed in SEEDS],
+    "ant-u-fast": [
+        *(Job("ant-u", "ris", seed) for seed in range(3)),
+        Job("ant-u", "sac", 0),
+    ],
     "ant-u": [Job("ant-u", agent, 0, BF16) for agent in ("ris", "sac", "leap")],
 }
 
