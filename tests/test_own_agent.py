@@ -1,5 +1,6 @@
 """An agent from outside the package is used exactly as one from inside (examples/gcbc.py)."""
 
+import importlib
 import json
 import os
 import subprocess
@@ -56,14 +57,13 @@ def test_from_the_command_line_to_the_report(tmp_path: Path) -> None:
 
 def test_an_agent_itself_is_trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
-    from gcbc import AGENT  # type: ignore[import-not-found]
-
+    agent = importlib.import_module("gcbc").AGENT
     changes = SMALL | {"steps": 100}
-    run = midway.train("point-u", agent=AGENT, out=tmp_path / "run", changes=changes)
+    run = midway.train("point-u", agent=agent, out=tmp_path / "run", changes=changes)
     assert run.finished
     policy = midway.load(run.path)
-    assert policy.agent is AGENT
-    assert registry.name_of(AGENT) == "gcbc:AGENT"
+    assert policy.agent is agent
+    assert registry.name_of(agent) == "gcbc:AGENT"
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,7 @@ def train(
     config = configure(env, agent, preset, seed, {**(changes or {}), **given})
     folder = RunFolder(Path(out or Path("runs") / run_name(env, config.agent, seed)))
     setup = setup_of(config, folder)
+    state.check(setup)
     folder.create(config)
     return _run(config, folder, setup, progress)
 

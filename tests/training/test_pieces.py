@@ -133,7 +133,6 @@ class Line:
 
     tasks = ("near",)
     goal_spec, resumable, logged_info = None, False, {}
-    state_dict = load_state_dict = None
 
     def __init__(self, num_envs: int) -> None:
         self.num_envs = num_envs
@@ -145,6 +144,12 @@ class Line:
         self.left[mask] = np.arange(1, self.num_envs + 1)[mask]
         self.elapsed[mask] = 0
         return self.observe(), {}
+
+    def state_dict(self) -> Any:
+        return {}
+
+    def load_state_dict(self, state: Any) -> None:
+        pass
 
     def observe(self) -> Any:
         return {

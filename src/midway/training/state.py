@@ -118,6 +118,20 @@ class Training:
 # --- start ----------------------------------------------------------------------------------------
 
 
+def check(setup: Setup) -> None:
+    """Find out whether the run can be started, before anything is written.
+
+    Raises:
+        ConfigurationError: A lane of the replay is too small, the agent cannot learn from this
+            environment, or the machine has fewer devices.
+    """
+    spec, train = setup.make_env(1, setup.train.task).goal_spec, setup.train
+    buffer.memory_bytes(spec, train.replay_capacity, train.num_envs)
+    _devices(setup)
+    key = seeds.training(setup.seed).network_key
+    eqx.filter_eval_shape(setup.agent.create, setup.hyperparameters, spec, key)
+
+
 def start(setup: Setup, say: Say | None = None) -> Training:
     """Return a run before its first step.
 
