@@ -15,7 +15,7 @@ from midway.training.evaluate import rollout
 class Lengths:
     """Environments whose episodes last as many steps as they are told."""
 
-    goal_spec, tasks, resumable, logged_info = None, ("near",), False, {}  # noqa: RUF012
+    goal_spec, tasks, resumable, logged_info = None, ("near",), False, {}
 
     def state_dict(self) -> Any:
         return {}
