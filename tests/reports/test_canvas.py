@@ -56,7 +56,7 @@ def test_maps_with_long_names(name, columns):
 
 
 def test_words_that_are_cut_off_are_found():
-    figure, (axes,) = style.figure(1, 1, height=3, width=4)
+    figure, (axes,) = style.figure(1, 1, height=3.0, width=4.0)
     style.label(axes, "title", "x", "y")
     figure.text(0.9, 0.5, "words at the edge")
     style.settle(figure)
