@@ -3,7 +3,7 @@
 import pytest
 
 from midway.envs.rendering import backend
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 
 def _why_not():

@@ -11,7 +11,7 @@ import pytest
 
 import midway
 from midway.agents import registry
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SMALL = {

@@ -11,9 +11,9 @@ from midway.agents import beyond
 from midway.agents.registry import AGENTS
 from midway.cli.main import main
 from midway.envs.registry import ENVIRONMENTS
+from midway.errors import ConfigurationError
 from midway.presets import RULES, Rule, Source
 from midway.training.config import TrainConfig
-from midway.types import ConfigurationError
 
 GOLDEN = json.loads((Path(__file__).parent / "golden" / "presets.json").read_text())
 RENAMED = {"encoder_updates": "freeze_encoder_after", "image_translation": "random_shift"}

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from midway.agents.registry import AGENTS
+from midway.errors import ConfigurationError
 from midway.runs.folder import RunConfig
 from midway.settings import Allowed, changed, check, declared, names, setting, split
 from midway.training.config import TrainConfig
-from midway.types import ConfigurationError, RelabelMix
+from midway.types import RelabelMix
 
 CONFIGS: dict[str, Any] = {"train": TrainConfig} | {n: a.Config for n, a in AGENTS.items()}
 EVERY = [

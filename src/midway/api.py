@@ -8,6 +8,7 @@ from midway import presets
 from midway.agent import AnyAgent
 from midway.agents import registry as agents
 from midway.envs import registry as environments
+from midway.errors import ConfigurationError
 from midway.runs import policy as policies
 from midway.runs.folder import RunConfig, RunFolder, run_name
 from midway.runs.policy import Policy
@@ -17,7 +18,7 @@ from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.logging import Logger
 from midway.training.progress import Reporter, Silent, reporter
 from midway.training.state import Training
-from midway.types import ConfigurationError, VectorGoalEnv
+from midway.types import VectorGoalEnv
 
 
 @dataclasses.dataclass(frozen=True)

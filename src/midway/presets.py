@@ -17,9 +17,10 @@ from midway import settings
 from midway.agents import registry as agents
 from midway.envs import registry as environments
 from midway.envs.registry import Declaration
+from midway.errors import ConfigurationError
 from midway.networks.mlp import fastest_precision
 from midway.training.config import TrainConfig
-from midway.types import ConfigurationError, Hyperparameters, RelabelMix
+from midway.types import Hyperparameters, RelabelMix
 
 Values: TypeAlias = Mapping[str, object]
 

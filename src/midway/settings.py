@@ -9,7 +9,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeAlias, TypeVar
 
-from midway.types import ConfigurationError, Hyperparameters
+from midway.errors import ConfigurationError
+from midway.types import Hyperparameters
 
 T = TypeVar("T")
 Config = TypeVar("Config", bound=Hyperparameters)

@@ -7,7 +7,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from midway.types import ConfigurationError, NumPyArray
+from midway.errors import ConfigurationError
+from midway.types import NumPyArray
 
 Table: TypeAlias = dict[str, NumPyArray]
 """Columns by name: float64, or text for the columns of ``TEXT_COLUMNS``."""

@@ -7,6 +7,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, runtime_check
 import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
+from midway.errors import ConfigurationError
+
 Metrics: TypeAlias = dict[str, Float[Array, ""]]
 """Scalars on the device, named ``group/name``."""
 
@@ -41,14 +43,6 @@ class Dataclass(Protocol):
 
 Hyperparameters: TypeAlias = Dataclass
 """A frozen dataclass of settings (`midway.settings`)."""
-
-
-class ConfigurationError(ValueError):
-    """A name, value or folder that the user gave cannot be used; its text is one clear line."""
-
-
-class NonFiniteError(RuntimeError):
-    """A loss or value became NaN or infinite; its text names the quantity."""
 
 
 @runtime_checkable

@@ -12,7 +12,8 @@ import pytest
 from midway import functional
 from midway.agent import Agent
 from midway.agents import beyond, leap, registry, ris, sac, tdm
-from midway.types import ConfigurationError, Subgoal
+from midway.errors import ConfigurationError
+from midway.types import Subgoal
 
 KEY = jax.random.key(7)
 ABILITIES = ("value", "subgoals", "memory", "pretrain", "freezing")

@@ -16,12 +16,12 @@ from midway.networks.policies import Gaussian
 from midway.types import Subgoal
 
 KEY = jax.random.key(7)
-STEPS = ("update_critic", "update_subgoal_policy", "update_policy", "update_copies")
+STEPS = ("update_critic", "update_subgoal_policy", "update_policy", "update_targets")
 CHANGES = {
     "update_critic": {"critic", "critic_optimizer", "encoder", "encoder_optimizer"},
     "update_subgoal_policy": {"subgoal_policy", "subgoal_optimizer"},
     "update_policy": {"policy", "policy_optimizer"},
-    "update_copies": {"target_critic", "prior_policy"},
+    "update_targets": {"target_critic", "prior_policy"},
 }
 
 
@@ -57,7 +57,7 @@ def steps(ris_case, monkeypatch):
 
 
 def test_steps_follow_the_papers_order_each_from_the_state_before_it(steps):
-    """Critics, subgoal policy, policy, copies: each reads the networks updated just before."""
+    """Critics, subgoal policy, policy, targets: each reads the networks just updated."""
     assert [name for name, _, _ in steps] == ["start", *STEPS, "end"]
     for (_, _, before), (name, after, _) in itertools.pairwise(steps):
         assert before is after, name

@@ -38,7 +38,7 @@ def test_density_of_squashed_actions_integrates_to_one():
     grid = np.linspace(-1 + 1e-4, 1 - 1e-4, 20_001)
     mean, log_std = jnp.full((len(grid), 1), 0.3), jnp.full((len(grid), 1), -0.5)
     noise = (np.arctanh(grid)[:, None] - 0.3) / np.exp(-0.5)
-    actions, log_density = sac.sample(Gaussian(mean, log_std), jnp.asarray(noise, jnp.float32))
+    actions, log_density = Gaussian(mean, log_std).squashed(jnp.asarray(noise, jnp.float32))
     np.testing.assert_allclose(actions[:, 0], grid, atol=1e-6)
     assert scipy.integrate.trapezoid(np.exp(log_density), grid) == pytest.approx(1, abs=1e-3)
 
@@ -46,7 +46,7 @@ def test_density_of_squashed_actions_integrates_to_one():
 def test_sampled_actions_and_densities_by_hand(sac_case):
     state, batch, noise = sac_case.state, sac_case.batch, noise_for(sac_case)
     actions = state.policy(batch.observation, batch.goal)
-    for ours, expected in zip(sac.sample(actions, noise), by_hand(actions, noise), strict=True):
+    for ours, expected in zip(actions.squashed(noise), by_hand(actions, noise), strict=True):
         np.testing.assert_allclose(ours, expected, rtol=1e-4, atol=1e-5)
 
 

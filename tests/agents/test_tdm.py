@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from midway.agents import tdm
-from midway.types import Batch, ConfigurationError, DistanceTask, EnvSpec, Outcome, Subgoal
+from midway.errors import ConfigurationError
+from midway.types import Batch, DistanceTask, EnvSpec, Outcome, Subgoal
 
 KEY = jax.random.key(7)
 TASK = DistanceTask(((0, 1),), 0.5)

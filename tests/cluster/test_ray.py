@@ -14,7 +14,7 @@ import pytest
 import midway
 from midway.cluster import sweep
 from midway.cluster.jobs import finished
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 pytestmark = [
     pytest.mark.extra,

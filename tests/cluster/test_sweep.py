@@ -7,8 +7,8 @@ import pytest
 from midway.cli.main import main
 from midway.cluster import sweep
 from midway.cluster.jobs import Job
+from midway.errors import ConfigurationError
 from midway.runs.folder import RunFolder
-from midway.types import ConfigurationError
 
 TINY = ["hidden=(8,)", "batch_size=8", "num_envs=4", "random_steps=16", "replay_capacity=2000"]
 TINY += ["evaluate_every=60", "evaluation_episodes=2", "log_every=20", "checkpoint_every=20"]

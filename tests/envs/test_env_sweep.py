@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from drawing_here import needs_renderer
 from midway.envs.registry import ENVIRONMENTS, make_vec
 from midway.envs.single import SingleGoalEnv
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 NAMES = list(ENVIRONMENTS)
 COPIES = 4

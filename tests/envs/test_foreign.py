@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 
 import midway
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 TINY = {
     "hidden": (8,),

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from midway.envs.geodesic import distance_field, geodesic_distance
 from midway.envs.mazes import MAZES, Rectangle
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 mazes = st.sampled_from(list(MAZES.values()))
 unit = st.tuples(st.floats(0, 1), st.floats(0, 1))

@@ -7,7 +7,7 @@ from gymnasium.error import ResetNeeded
 from midway.envs.geodesic import geodesic_distance
 from midway.envs.mazes import MAZES
 from midway.envs.registry import make_vec
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 every_maze = pytest.mark.parametrize("shape", MAZES)
 

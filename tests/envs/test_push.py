@@ -15,7 +15,7 @@ from midway.envs.push_scene import (
     push_model,
 )
 from midway.envs.registry import make_vec
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 PUCK_LIMITS = np.array(((-0.189, 0.511), (0.189, 0.689)))
 """Lowest and highest x, y of a puck that lies on the table within the boundary (m)."""

@@ -13,7 +13,7 @@ from midway.envs.push_scene import HAND_BOX, IMAGE_SIZE, PUCK_BOX, TASKS, push_m
 from midway.envs.registry import make_vec
 from midway.envs.rendering import BACKENDS, Renderer, backend, draw
 from midway.envs.single import SingleGoalEnv
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 
 def far_from(states):
@@ -227,7 +227,7 @@ def test_a_forked_child_draws_the_same():
 WITHOUT_RENDERER = """
 from midway.envs import rendering
 from midway.envs.registry import make_vec
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 rendering.BACKENDS = ("none", "nothing")
 try:
     make_vec("push")

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from midway.errors import ConfigurationError
 from midway.networks import encoder as encoders
 from midway.networks.encoder import NUM_FEATURES
 from midway.networks.mlp import Precision
-from midway.types import Batch, ConfigurationError, DistanceTask, EnvSpec, Subgoal
+from midway.types import Batch, DistanceTask, EnvSpec, Subgoal
 
 KEY = jax.random.key(0)
 

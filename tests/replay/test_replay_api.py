@@ -18,10 +18,11 @@ from replay_reference import (
     sample,
 )
 
+from midway.errors import ConfigurationError
 from midway.replay import buffer
 from midway.replay.buffer import create, memory_bytes, num_transitions
 from midway.replay.relabel import source_counts
-from midway.types import ConfigurationError, DistanceTask, EnvSpec, RelabelMix
+from midway.types import DistanceTask, EnvSpec, RelabelMix
 
 TASK = DistanceTask(groups=((0, 1),), threshold=0.5)
 ANT = EnvSpec("ant-u", (31,), "float32", (31,), 8, 600, True, None, TASK)

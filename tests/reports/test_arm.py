@@ -13,11 +13,11 @@ from drawing_here import needs_renderer
 from midway import api
 from midway.cli.main import main
 from midway.envs.registry import make_vec
+from midway.errors import ConfigurationError
 from midway.reports import decoder, images, recordings, report, tabletop, videos, watch
 from midway.reports.recordings import Recording
 from midway.reports.scenes import TableScene, Words
 from midway.runs.folder import RunFolder
-from midway.types import ConfigurationError
 
 
 def stems(files):

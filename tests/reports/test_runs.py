@@ -4,10 +4,10 @@ import dataclasses
 
 import pytest
 
+from midway.errors import ConfigurationError
 from midway.reports import report
 from midway.reports.runs import groups, read
 from midway.tables import read as read_table
-from midway.types import ConfigurationError
 
 
 def with_config(run, **changes):

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from midway import api
+from midway.errors import ConfigurationError
 from midway.reports import videos, watch
 from midway.reports.cache import chain
 from midway.reports.recordings import draws, record
-from midway.types import ConfigurationError
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio's reader

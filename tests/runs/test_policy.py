@@ -11,8 +11,9 @@ import pytest
 import midway
 from midway.envs import registry
 from midway.envs.push import IMAGE_SPEC, STATE_SPEC
+from midway.errors import ConfigurationError
 from midway.runs.folder import RunFolder
-from midway.types import ConfigurationError, EnvSpec, UnknownTask
+from midway.types import EnvSpec, UnknownTask
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 TINY = {

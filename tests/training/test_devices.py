@@ -12,9 +12,9 @@ import pytest
 
 import midway
 from midway import api
+from midway.errors import ConfigurationError
 from midway.runs.folder import RunFolder
 from midway.training import state
-from midway.types import ConfigurationError
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from midway import api
 from midway.agents import leap, ris
 from midway.agents.registry import AGENTS
 from midway.envs.push import IMAGE_SPEC, STATE_SPEC
+from midway.errors import ConfigurationError
 from midway.networks import encoder as encoders
 from midway.replay import buffer
 from midway.runs.folder import RunFolder
@@ -25,7 +26,6 @@ from midway.training.arrays import named_arrays
 from midway.training.checkpoint import Checkpoints
 from midway.training.config import TrainConfig
 from midway.training.state import Training
-from midway.types import ConfigurationError
 
 FROZEN = SMALL | {"encoder_batch_size": 0, "precision": "f32", "freeze_encoder_after": 10}
 

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from midway import api, presets
 from midway.agents.registry import AGENTS
 from midway.envs.registry import ENVIRONMENTS, make_vec
+from midway.errors import ConfigurationError
 from midway.runs.folder import RunConfig, RunFolder
 from midway.tables import Appender
 from midway.training import loop, progress, state
 from midway.training.arrays import named_arrays, with_named_arrays
 from midway.training.config import TrainConfig
 from midway.training.evaluate import run_episodes
-from midway.types import ConfigurationError
 
 TINY = {"hidden": (8,), "batch_size": 8, "num_envs": 4, "replay_capacity": 2_000}
 

@@ -14,10 +14,10 @@ import midway
 from midway import api
 from midway.agent import PretrainSettings
 from midway.agents import leap, tdm
+from midway.errors import ConfigurationError, NonFiniteError
 from midway.runs.folder import RunFolder
 from midway.training import pretrain, state
 from midway.training.evaluate import rollout
-from midway.types import ConfigurationError, NonFiniteError
 
 TINY: dict[str, Any] = {
     "hidden": (8, 8),

@@ -14,12 +14,12 @@ import pytest
 
 import midway
 from midway import api
+from midway.errors import ConfigurationError, NonFiniteError
 from midway.runs.folder import RunFolder
 from midway.runs.policy import load
 from midway.training import loop, state
 from midway.training.checkpoint import Checkpoints
 from midway.training.state import Training
-from midway.types import ConfigurationError, NonFiniteError
 
 SMALL = {
     "hidden": (8, 8),

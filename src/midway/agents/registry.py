@@ -4,7 +4,7 @@ import importlib
 
 from midway.agent import Agent, AnyAgent
 from midway.agents import crl, leap, ris, sac, tdm
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 AGENTS: dict[str, AnyAgent] = {
     "ris": ris.AGENT,

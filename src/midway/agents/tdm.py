@@ -17,13 +17,14 @@ from jaxtyping import Array, Float, Int, Key, Shaped
 
 from midway import functional
 from midway.agent import Agent, EpisodeMemory, Freezing, Value
+from midway.errors import ConfigurationError
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
 from midway.networks.encoder import Encoder
 from midway.networks.initialization import with_small_output
 from midway.networks.mlp import MLP, PRECISIONS, Precision
 from midway.settings import check, setting
-from midway.types import Batch, ConfigurationError, EnvSpec, Metrics
+from midway.types import Batch, EnvSpec, Metrics
 
 OUTPUT_BOUND = 3e-3
 """Output weights start uniform in ± this (original code)."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from midway.cli.parsing import Count, OptionalCount, parse, plain, settings
-from midway.types import ConfigurationError, NonFiniteError
+from midway.errors import ConfigurationError, NonFiniteError
 
 if TYPE_CHECKING:
     from midway.api import Run

@@ -11,7 +11,7 @@ from typing import Annotated, ParamSpec
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 Arguments = ParamSpec("Arguments")
 

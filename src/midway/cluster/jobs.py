@@ -10,8 +10,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from midway import tables
+from midway.errors import ConfigurationError
 from midway.runs.folder import RunFolder, run_name
-from midway.types import ConfigurationError
 
 State: TypeAlias = Literal["waiting", "running", "finished", "failed"]
 

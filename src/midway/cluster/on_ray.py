@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from midway.cluster.jobs import Job, State, execute, finished
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 RETRIES = 20
 REACH_SECONDS = 10.0

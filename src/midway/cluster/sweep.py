@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 from midway.cluster import on_ray
 from midway.cluster.jobs import POLL_SECONDS, Job, State, execute, finished, last_success
+from midway.errors import ConfigurationError
 from midway.runs.folder import RunFolder
-from midway.types import ConfigurationError
 
 if TYPE_CHECKING:
     from rich.table import Table

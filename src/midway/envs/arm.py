@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 JOINT_DAMPING = 10.0
 """Damping of every joint (N m s/rad)."""

@@ -16,7 +16,8 @@ from gymnasium import spaces
 from jaxtyping import Int, Shaped
 
 from midway.envs.vector import Array, GoalVectorEnv, Observations
-from midway.types import ArrayLike, ConfigurationError, EnvSpec
+from midway.errors import ConfigurationError
+from midway.types import ArrayLike, EnvSpec
 
 DEFAULT_EPISODE_STEPS = 1000
 """Steps of an episode where the environment was registered without a limit."""

@@ -11,7 +11,8 @@ from jaxtyping import Float, Float32, Int
 from midway.envs.mazes import WALL_HEIGHT, Maze
 from midway.envs.simulation import SimulationVectorEnv
 from midway.envs.vector import Array
-from midway.types import ConfigurationError, DistanceTask, EnvSpec, Observations, Options
+from midway.errors import ConfigurationError
+from midway.types import DistanceTask, EnvSpec, Observations, Options
 
 GOAL_THRESHOLD = 0.5
 """Distance in x-y below which the goal is reached (m); paper, appendix C."""

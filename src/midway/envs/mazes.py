@@ -11,7 +11,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Bool, Float
 
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 WALL_HEIGHT = 1.0
 """Height of every wall above the floor (m)."""

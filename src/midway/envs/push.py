@@ -24,7 +24,8 @@ from midway.envs.push_scene import (
 from midway.envs.rendering import backend, draw
 from midway.envs.simulation import SimulationVectorEnv
 from midway.envs.vector import Array
-from midway.types import ConfigurationError, DistanceTask, EnvSpec, Observations, Options
+from midway.errors import ConfigurationError
+from midway.types import DistanceTask, EnvSpec, Observations, Options
 
 SUBSTEPS = 50
 """Simulation steps for each step: 0.1 s."""

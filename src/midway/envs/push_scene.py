@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from midway.envs.arm import HAND_HEIGHT, HAND_QUATERNION, arm_mjcf
 from midway.envs.mazes import Rectangle
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 TIMESTEP = 0.002
 """Seconds of one simulation step."""

@@ -9,7 +9,7 @@ import gymnasium
 
 from midway.envs.mazes import MAZES, Maze
 from midway.envs.views import MazeView, TableView, View
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from midway.envs.vector import GoalVectorEnv

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 BACKENDS = ("egl", "osmesa")
 """The ways to draw without a display, in the order of trial: MuJoCo's modules of these names.

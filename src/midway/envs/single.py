@@ -7,7 +7,8 @@ import numpy as np
 
 from midway.envs.registry import make_vec
 from midway.envs.vector import Array
-from midway.types import ArrayLike, ConfigurationError, Info, Observations, Options
+from midway.errors import ConfigurationError
+from midway.types import ArrayLike, Info, Observations, Options
 
 Scalars: TypeAlias = dict[str, float | int]
 """Info of one environment."""

@@ -11,15 +11,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Int, Shaped, UInt64
 
-from midway.types import (
-    ConfigurationError,
-    DistanceTask,
-    EnvSpec,
-    Info,
-    NumPyArray,
-    Options,
-    Step,
-)
+from midway.errors import ConfigurationError
+from midway.types import DistanceTask, EnvSpec, Info, NumPyArray, Options, Step
 from midway.types import Observations as Observations
 
 Array: TypeAlias = NumPyArray

@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, Shaped, UInt8
 
+from midway.errors import ConfigurationError
 from midway.networks.convolution import Filter, in_blocks
 from midway.networks.initialization import with_centre_tap, with_orthogonal_weight
 from midway.networks.mlp import Linear, Precision
-from midway.types import Batch, ConfigurationError, EnvSpec, Subgoal
+from midway.types import Batch, EnvSpec, Subgoal
 
 NUM_FEATURES = 16
 """Features of an image (appendix B)."""

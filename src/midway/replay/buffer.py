@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
+from midway.errors import ConfigurationError
 from midway.replay.relabel import FAR, Rows, draw, goal_rows, rows_between, source_counts
 from midway.replay.storage import (
     ReplayState,
@@ -22,7 +23,6 @@ from midway.replay.storage import (
 from midway.types import (
     AnyArray,
     Batch,
-    ConfigurationError,
     EnvSpec,
     Observation,
     Outcome,

@@ -14,6 +14,7 @@ from midway.envs import registry as environments
 from midway.envs.geodesic import geodesic_distance
 from midway.envs.mazes import ROBOT_RADIUS, Maze
 from midway.envs.views import MazeView, TableView
+from midway.errors import ConfigurationError
 from midway.networks.decoder import ImageDecoder
 from midway.reports import decoder, recordings
 from midway.reports.recordings import Recording, record
@@ -21,7 +22,6 @@ from midway.reports.runs import Group, RunData
 from midway.runs import policy as policies
 from midway.runs.policy import Policy
 from midway.tables import Table
-from midway.types import ConfigurationError
 
 SEED = 20_210_718
 """Seed of starts and goals in figures: the same for every run, and met in no training."""

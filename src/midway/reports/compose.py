@@ -4,12 +4,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
+from midway.errors import ConfigurationError
 from midway.reports import curves, difficulty, health, images, imagined, maze, page, style, tabletop
 from midway.reports.cache import Cache
 from midway.reports.page import Section, Shown
 from midway.reports.runs import RunData, Runs, by_environment, read
 from midway.reports.style import Picture
-from midway.types import ConfigurationError
 
 PAGE = "report.html"
 TABLES = "data"

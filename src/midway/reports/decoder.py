@@ -19,12 +19,13 @@ from jaxtyping import Array, Float, Int, Key, PyTree, Shaped, UInt8
 
 from midway.agent import Encoder, PretrainSettings
 from midway.envs import registry as environments
+from midway.errors import ConfigurationError
 from midway.networks.decoder import ImageDecoder, loss
 from midway.runs.folder import RunFolder
 from midway.runs.policy import Policy
 from midway.training.arrays import load_arrays, named_arrays, save_arrays
 from midway.training.pretrain import sample_states
-from midway.types import AnyArray, ConfigurationError, VectorGoalEnv
+from midway.types import AnyArray, VectorGoalEnv
 
 Result = TypeVar("Result")
 

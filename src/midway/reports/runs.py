@@ -13,10 +13,11 @@ from midway.agent import AnyAgent
 from midway.agents import registry as agents
 from midway.envs import registry as environments
 from midway.envs.views import View
+from midway.errors import ConfigurationError
 from midway.reports import style
 from midway.runs.folder import RunConfig, RunFolder, read_json, run_name
 from midway.tables import Table
-from midway.types import ConfigurationError, JsonObject
+from midway.types import JsonObject
 
 Row: TypeAlias = dict[str, float]
 """One row of numbers by column."""

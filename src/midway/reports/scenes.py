@@ -15,13 +15,14 @@ from matplotlib.text import Text
 
 from midway.envs import registry as environments
 from midway.envs.views import MazeView, TableView
+from midway.errors import ConfigurationError
 from midway.reports import decoder, style, tabletop
 from midway.reports import maze as maps
 from midway.reports.decoder import Images
 from midway.reports.recordings import Recording, imagined, in_every_state, plans
 from midway.runs.folder import RunFolder
 from midway.runs.policy import Policy
-from midway.types import ConfigurationError, DistanceTask
+from midway.types import DistanceTask
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
 

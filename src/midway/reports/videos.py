@@ -13,12 +13,12 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
+from midway.errors import ConfigurationError
 from midway.reports import scenes
 from midway.reports.recordings import Recording, record
 from midway.reports.runs import RunData, agent_labels, read
 from midway.reports.scenes import Frame, Scene
 from midway.runs import policy as policies
-from midway.types import ConfigurationError
 
 SECONDS = 8
 """How long a long episode takes in the video; short ones are shown at the lowest rate."""

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from midway.agents import registry
+from midway.errors import ConfigurationError
 from midway.settings import changed
 from midway.training.config import TrainConfig
-from midway.types import ConfigurationError, Hyperparameters, JsonObject
+from midway.types import Hyperparameters, JsonObject
 
 FORMAT = 2
 """Counted up when the files of a run change; format 1 is still understood."""

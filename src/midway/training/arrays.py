@@ -12,7 +12,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save_file
 
 from midway.agent import AgentState
-from midway.types import AnyArray, ConfigurationError
+from midway.errors import ConfigurationError
+from midway.types import AnyArray
 
 Tree = TypeVar("Tree", bound=PyTree)
 

@@ -7,7 +7,8 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from midway.types import AnyArray, ConfigurationError, NumPyArray
+from midway.errors import ConfigurationError
+from midway.types import AnyArray, NumPyArray
 
 Stored: TypeAlias = dict[str, Any]
 """Dictionaries of arrays, within each other."""

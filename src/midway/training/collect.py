@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from midway.errors import ConfigurationError
 from midway.replay.storage import ReplayState
 from midway.training import step
 from midway.training.checkpoint import Stored
-from midway.types import ConfigurationError, NumPyArray, Observations, VectorGoalEnv
+from midway.types import NumPyArray, Observations, VectorGoalEnv
 
 Actions = Callable[[Observations], NumPyArray]
 

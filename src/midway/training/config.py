@@ -3,8 +3,9 @@
 from dataclasses import dataclass, field
 from fractions import Fraction
 
+from midway.errors import ConfigurationError
 from midway.settings import check, setting
-from midway.types import ConfigurationError, RelabelMix
+from midway.types import RelabelMix
 
 LARGEST = 10**12
 """Bound of counts: more could not be run or stored."""

@@ -13,7 +13,7 @@ import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
-from midway.types import ConfigurationError
+from midway.errors import ConfigurationError
 
 Tree = TypeVar("Tree", bound=PyTree)
 Inputs = ParamSpec("Inputs")

@@ -16,12 +16,13 @@ from typing import Protocol, TypeAlias, runtime_checkable
 import jax
 import numpy as np
 
+from midway.errors import NonFiniteError
 from midway.training import acting
 from midway.training.arrays import named_arrays
 from midway.training.compilation import give_back_memory
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.state import Counters, Training, freeze_encoder
-from midway.types import NonFiniteError, NumPyArray, Observations
+from midway.types import NumPyArray, Observations
 
 EVALUATED_TASKS = ("hard", "uniform")
 EVALUATED_ACTIONS: tuple[ActionKind, ...] = ("mean", "sampled")

@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from midway.agent import AgentState, Pretrain, PretrainSettings
+from midway.errors import NonFiniteError
 from midway.tables import Appender
 from midway.training import seeds
 from midway.training.arrays import load_arrays, networks_of, save_arrays
-from midway.types import NonFiniteError, Observations, Subgoal, VectorGoalEnv
+from midway.types import Observations, Subgoal, VectorGoalEnv
 
 MakeEnv: TypeAlias = Callable[[int, str], VectorGoalEnv]
 """``(number of environments, task) -> vector environment``."""
