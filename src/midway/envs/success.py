@@ -118,13 +118,21 @@ class AskedRule(HostRule):
         """Return whether each goal ``(B, goal_dim)`` is reached ``(B,)``."""
         return self.answers(judge(self.source), achieved, desired)
 
+    @property
+    def threshold(self) -> float:
+        """Reached where the answer, as a number, is above this."""
+        return 0.5 if self.above is None else self.above
+
     def answers(self, env: Any, achieved: Array, desired: Array) -> Array:
-        """Return what an environment says of each pair ``(B,)``."""
+        """Return whether an environment says that each goal is reached ``(B,)``."""
+        reached: Array = self.values(env, achieved, desired) > self.threshold
+        return reached
+
+    def values(self, env: Any, achieved: Array, desired: Array) -> Array:
+        """Return what an environment answers to each pair ``(B,)``, as float64."""
         shape = (len(achieved), *self.goal_shape)
-        values = ask(
-            env, self.method, achieved.reshape(shape), desired.reshape(shape), self.batched
-        )
-        return values > (0.5 if self.above is None else self.above)
+        pairs = achieved.reshape(shape), desired.reshape(shape)
+        return ask(env, self.method, *pairs, self.batched)
 
     def to_json(self) -> dict[str, Any]:
         """Return what a run folder stores.
