@@ -162,7 +162,9 @@ def _answers(evidence: Evidence, rule: AskedRule, achieved: Array, desired: Arra
             again = rule.values(evidence.env, achieved, desired)
     except Exception as error:
         text = " ".join(str(error).split())
-        raise _UnfitError(f"cannot be asked about two goals ({type(error).__name__}: {text})") from error
+        raise _UnfitError(
+            f"cannot be asked about two goals ({type(error).__name__}: {text})"
+        ) from error
     if np.isnan(answers).any():
         raise _UnfitError("is NaN")
     if not np.array_equal(answers, again):
@@ -176,10 +178,10 @@ def _threshold(rewards: Array, at_goal: Array) -> float:
     Raises:
         _UnfitError: The reward does not have two values, or the wrong ones.
     """
-    values = np.unique(np.round(rewards, 9))
+    values = np.unique(np.round(rewards, 9)) + 0.0  # not -0
     if len(values) == 1:
         raise _UnfitError(f"is always {values[0]:.4g}")
-    best = np.round(rewards[at_goal], 9)
+    best = np.round(rewards[at_goal], 9) + 0.0
     if len(values) > 2:
         raise _UnfitError(
             f"is dense ({best.max():.4g} at the goal, down to {values[0]:.4g} elsewhere)"
@@ -329,7 +331,9 @@ def _bracket(probes: list[Probes], key: str) -> tuple[float, float]:
     distance = np.concatenate([np.linalg.norm(p.achieved - p.desired, axis=1) for p in probes])
     word = np.concatenate([p.word for p in probes])
     if not (word == 1).any():
-        raise _UnfitError(f"{key} was never true in random episodes, so it says nothing of other goals")
+        raise _UnfitError(
+            f"{key} was never true in random episodes, so it says nothing of other goals"
+        )
     if not (word == 0).any():
         raise _UnfitError(f"{key} was always true")
     low, high = float(distance[word == 1].max()), float(distance[word == 0].min())
@@ -341,11 +345,11 @@ def _bracket(probes: list[Probes], key: str) -> tuple[float, float]:
 
 
 def roundest(low: float, high: float) -> float:
-    """Return the number in (low, high] with the fewest digits."""
+    """Return the number in (low, high] with the fewest digits, in their middle if there are more."""
     for digits in itertools.count(1):
         unit = 10.0 ** (np.floor(np.log10(high)) + 1 - digits)
-        number = float(f"{np.floor(high / unit + 1e-9) * unit:.12g}")
-        if number > low or digits > 12:
+        number = float(f"{np.round((low + high) / 2 / unit) * unit:.12g}")
+        if low < number <= high or digits > 12:
             return number
     raise AssertionError
 

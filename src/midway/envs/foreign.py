@@ -106,7 +106,7 @@ class Foreign:
         """
         try:
             shapes = ("observation_shape", "goal_shape", "state_shape")
-            spec = {
+            spec: dict[str, Any] = {
                 name: tuple(value) if name in shapes and value is not None else value
                 for name, value in stored["spec"].items()
             }
@@ -178,6 +178,16 @@ def describe(
         task=rule,
     )
     return Foreign(origin, spec, settings, seen.seconds)
+
+
+@functools.lru_cache(maxsize=32)
+def described(name: str, settings: Settings = Settings()) -> Foreign:
+    """Return the description of an environment by its name, made once for each process.
+
+    Raises:
+        ConfigurationError: As `describe`.
+    """
+    return describe(name, settings)
 
 
 class ForeignVectorEnv(GoalVectorEnv):

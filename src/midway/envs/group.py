@@ -56,12 +56,12 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
             name: reading.box(size) for name, reading in self.readings.items()
         }
         flags = {name: spaces.Box(-1, 1, (size,), np.int8) for name in FLAGS}
-        self.observation_space = spaces.Dict(boxes | flags)
+        shown = spaces.Dict(boxes | flags)
+        self.observation_space: spaces.Space[Any] = shown
         self.action_space = spaces.Box(-1, 1, (size, self.low.size), np.float32)
         self.envs: list[Any] = []
         self.held: dict[str, Array] = {
-            name: np.zeros(box.shape or (), box.dtype)
-            for name, box in self.observation_space.items()
+            name: np.zeros(box.shape or (), box.dtype) for name, box in shown.items()
         }
 
     def reset(
@@ -79,9 +79,7 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
                 self._hold(place, observation, info, False, False)
         return self.held, {}
 
-    def step(
-        self, actions: Array
-    ) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+    def step(self, actions: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """Move every environment by one step, by actions in [-1, 1]."""
         scaled = self.low + (np.clip(actions, -1, 1) + 1) / 2 * (self.high - self.low)
         for place, env in enumerate(self.envs):

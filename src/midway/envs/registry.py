@@ -4,15 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-import gymnasium
-
 from midway.envs.ant_maze import AntMazeVectorEnv
-from midway.envs.foreign import ForeignVectorEnv
+from midway.envs.foreign import ForeignVectorEnv, described
 from midway.envs.ids import GYM_IDS
 from midway.envs.mazes import MAZES
 from midway.envs.point_maze import PointMazeVectorEnv
 from midway.envs.push import PushStateVectorEnv, PushVectorEnv
 from midway.envs.push_scene import TASKS
+from midway.envs.sources import UnknownEnvironmentError
 from midway.envs.vector import GoalVectorEnv
 from midway.types import ConfigurationError
 
@@ -75,13 +74,16 @@ def entry(name: str) -> Entry:
     """
     if name in ENVIRONMENTS:
         return ENVIRONMENTS[name]
-    if name in gymnasium.registry:
-        factory = partial(ForeignVectorEnv, name)
-        return Entry(name, name, "registered with Gymnasium", ("uniform",), factory)
-    raise ConfigurationError(
-        f"unknown environment {name!r}: use one of {', '.join(ENVIRONMENTS)}, or the Gymnasium id "
-        "of a goal environment"
-    )
+    try:
+        foreign = described(name)
+    except UnknownEnvironmentError as error:
+        own = ", ".join(ENVIRONMENTS)
+        raise ConfigurationError(
+            f"{error}; midway's own are {own}, and any goal environment goes by its Gymnasium id "
+            "or module:name"
+        ) from error
+    factory = partial(ForeignVectorEnv, foreign)
+    return Entry(name, name, foreign.rule.description, ("uniform",), factory)
 
 
 def make_vec(

@@ -8,7 +8,6 @@ returned, serves too.
 import contextlib
 import functools
 import importlib
-import inspect
 import json
 import os
 import re
@@ -25,6 +24,10 @@ from midway.types import ConfigurationError
 
 Env: TypeAlias = Any
 """A Gymnasium environment of any kind of observation and action."""
+
+
+class UnknownEnvironmentError(ConfigurationError):
+    """There is no environment of this name."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +180,7 @@ def _register(name: str) -> None:
     """Import what registers a Gymnasium id.
 
     Raises:
-        ConfigurationError: There is no environment of this name.
+        UnknownEnvironmentError: There is no environment of this name.
     """
     module, _, gym_id = name.rpartition(":")
     if module:
@@ -188,7 +191,7 @@ def _register(name: str) -> None:
         gymnasium.spec(gym_id)
     except gymnasium.error.Error as error:
         hint = packages.hint(gym_id)
-        raise ConfigurationError(
+        raise UnknownEnvironmentError(
             f"unknown environment {name!r}: {hint or ' '.join(str(error).split())}"
         ) from error
 
@@ -205,6 +208,8 @@ def _callable(reference: str) -> Callable[..., Any] | None:
 
 
 def _reference(function: Callable[..., Any]) -> str:
+    if isinstance(function, functools.partial):
+        return f"{_reference(function.func)}(...)"
     name = getattr(function, "__qualname__", type(function).__name__)
     return f"{getattr(function, '__module__', '?')}:{name}"
 
@@ -265,14 +270,3 @@ def _line(error: Exception) -> str:
         return text
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__}: {text} ({os.path.basename(place.filename)}:{place.lineno})"
-
-
-def name_of(env: Any) -> str:
-    """Return the name of an environment as a user gave it, for messages and folders."""
-    if isinstance(env, str):
-        return env
-    if isinstance(env, Source):
-        return env.reference
-    if isinstance(env, gymnasium.Env):
-        return env.spec.id if env.spec is not None else type(env).__name__
-    return _reference(env) if callable(env) else inspect.getdoc(type(env)) or repr(env)

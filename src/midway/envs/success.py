@@ -224,7 +224,9 @@ def from_json(stored: Mapping[str, Any]) -> Rule:
             return FunctionRule(**values)
     except (KeyError, TypeError) as error:
         raise ConfigurationError(f"success rule {json.dumps(dict(stored))}: {error}") from error
-    raise ConfigurationError(f"success rule {stored['rule']!r}: must be distance, asked or function")
+    raise ConfigurationError(
+        f"success rule {stored['rule']!r}: must be distance, asked or function"
+    )
 
 
 @functools.lru_cache(maxsize=8)

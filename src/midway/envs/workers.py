@@ -106,7 +106,8 @@ def _shut(vector: Any) -> None:
 def _without_script() -> Iterator[None]:
     """Hide the user's script from new processes, which would run it again."""
     script = sys.modules["__main__"]
-    hidden = {name: vars(script)[name] for name in ("__file__", "__spec__") if name in vars(script)}
+    names = ("__file__", "__spec__")
+    hidden: dict[str, Any] = {name: vars(script)[name] for name in names if name in vars(script)}
     try:
         vars(script).pop("__file__", None)
         script.__spec__ = None
