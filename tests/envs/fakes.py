@@ -145,6 +145,11 @@ def limited(**options: Any) -> gymnasium.Env[Any, Any]:
     return gymnasium.wrappers.TimeLimit(Plane(**options), 20)
 
 
+def broken() -> Any:
+    """Fail as gymnasium-robotics does: without a word."""
+    raise AssertionError
+
+
 def within(achieved: Any, desired: Any) -> Any:
     """Whether the goal is near, of NumPy and JAX arrays."""
     return ((achieved - desired) ** 2).sum(-1) < RADIUS**2

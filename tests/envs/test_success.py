@@ -200,11 +200,15 @@ def test_info_that_contradicts_the_rule_later_stops_the_run() -> None:
     )
     env = ForeignVectorEnv(Foreign(lying.source, foreign.spec), 4)
     env.reset(seed=0)
-    with pytest.raises(ConfigurationError, match="not a matter of the two goals alone"):
+
+    def run() -> None:
         for _ in range(200):
-            _, _, terminated, truncated, _ = env.step(np.zeros((4, 2), np.float32) + 0.5)
+            _, _, terminated, truncated, _ = env.step(np.full((4, 2), 0.5, np.float32))
             if (terminated | truncated).any():
                 env.reset(options={"reset_mask": terminated | truncated})
+
+    with pytest.raises(ConfigurationError, match="not a matter of the two goals alone"):
+        run()
 
 
 def test_a_threshold_that_belongs_to_success_is_kept() -> None:

@@ -345,7 +345,7 @@ def _bracket(probes: list[Probes], key: str) -> tuple[float, float]:
 
 
 def roundest(low: float, high: float) -> float:
-    """Return the number in (low, high] with the fewest digits, in their middle if there are more."""
+    """Return the number in (low, high] with the fewest digits."""
     for digits in itertools.count(1):
         unit = 10.0 ** (np.floor(np.log10(high)) + 1 - digits)
         number = float(f"{np.round((low + high) / 2 / unit) * unit:.12g}")
