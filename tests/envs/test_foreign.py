@@ -241,7 +241,7 @@ def test_actions_that_are_no_numbers_within_bounds_are_refused(space: Any, reaso
 def test_what_is_not_finite_stops_with_its_name() -> None:
     with pytest.raises(ConfigurationError, match=r"observation\[0\] is nan after 3 steps"):
         plane(broken_at=3)
-    broken = Foreign(source(fakes.limited, {"broken_at": 3}), plane().spec)
+    broken = Foreign(source(fakes.limited, {"broken_at": 3}), plane(Settings(1e-6)).spec)
     env = ForeignVectorEnv(broken, 2)
     env.reset(seed=0)
     env.step(0 * RIGHT)
