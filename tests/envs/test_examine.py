@@ -10,7 +10,7 @@ from midway.envs.foreign import Settings
 
 
 def found(options: dict[str, Any], settings: Settings | None = None) -> list[Finding]:
-    return examine(fakes.limited, settings, num_envs=4, seconds=5, kwargs=options)
+    return examine(fakes.limited, settings, num_envs=4, seconds=5.0, kwargs=options)
 
 
 def test_about_ten_lines_say_what_midway_sees() -> None:

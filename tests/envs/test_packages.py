@@ -52,7 +52,9 @@ def plain_episode(gym_id: str, seed: int, noise: int) -> tuple[bool, int, bool]:
     rng = np.random.default_rng(noise)
     observation, _ = env.reset(seed=seed)
     dims = env.action_space.shape[0]
-    for length in range(1, limit + 1):
+    length, success = 0, False
+    while length < limit:
+        length += 1
         action = push(observation, gain, dims, rng)
         low, high = env.action_space.low, env.action_space.high
         scaled = low + (action + 1) / 2 * (high - low)
@@ -69,7 +71,7 @@ def test_success_is_what_the_environment_says_itself(gym_id: str) -> None:
     foreign = described(gym_id)
     gain = CASES[gym_id][2]
     env = ForeignVectorEnv(foreign, EPISODES, num_threads=1)
-    observation, _ = env.reset(seed=10)
+    env.reset(seed=10)
     noises = [np.random.default_rng(copy) for copy in range(EPISODES)]
     mine: dict[int, tuple[bool, int, bool]] = {}
     while len(mine) < EPISODES:
@@ -80,7 +82,7 @@ def test_success_is_what_the_environment_says_itself(gym_id: str) -> None:
                 for copy, noise in enumerate(noises)
             ]
         )
-        observation, _, terminated, truncated, info = env.step(actions)
+        _, _, terminated, truncated, info = env.step(actions)
         ended = terminated | truncated
         for copy in np.flatnonzero(ended):
             length = int(info["elapsed_steps"][copy])

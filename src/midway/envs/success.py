@@ -4,6 +4,7 @@ A rule is a `GoalTask`: frozen, hashable, storable as JSON, and callable on NumP
 compiled steps. Which rule an environment gets is decided in ``deciding.py``.
 """
 
+import atexit
 import functools
 import importlib
 import json
@@ -235,6 +236,10 @@ def judge(source: Source) -> Any:
     env = source.make()
     env.reset(seed=1)
     return env
+
+
+# While Python still runs: simulators that are left to its end complain.
+atexit.register(judge.cache_clear)
 
 
 def method_of(env: Any, name: str) -> Callable[..., Any] | None:
