@@ -19,7 +19,7 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
 import midway
-from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, describe, with_limit
+from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, admit, describe, with_limit
 from midway.envs.sources import source
 from midway.types import ConfigurationError, NonFiniteError
 
@@ -362,3 +362,10 @@ def test_what_is_no_environment_is_refused_by_name() -> None:
         midway.make_vec("Pendulum-v1")
     with pytest.raises(ConfigurationError, match=r"unknown environment 'Nowhere-v0'.*point-u"):
         midway.make_vec("Nowhere-v0")
+
+
+def test_what_was_described_goes_by_its_name() -> None:
+    foreign = describe(lambda: fakes.limited(), Settings(0.7))
+    assert midway.make_vec(foreign).goal_spec == foreign.spec
+    admit(foreign)
+    assert midway.make_vec(foreign.spec.name).goal_spec.task.threshold == 0.7

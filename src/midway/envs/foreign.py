@@ -180,14 +180,22 @@ def describe(
     return Foreign(origin, spec, settings, seen.seconds)
 
 
-@functools.lru_cache(maxsize=32)
-def described(name: str, settings: Settings = Settings()) -> Foreign:
-    """Return the description of an environment by its name, made once for each process.
+_ADMITTED: dict[str, Foreign] = {}
+
+
+def admit(foreign: Foreign) -> Foreign:
+    """Let an environment go by its name in this process, also one that only an object makes."""
+    _ADMITTED[foreign.spec.name] = foreign
+    return foreign
+
+
+def described(name: str) -> Foreign:
+    """Return the environment that was admitted by this name, else describe and admit it.
 
     Raises:
         ConfigurationError: As `describe`.
     """
-    return describe(name, settings)
+    return _ADMITTED.get(name) or admit(describe(name))
 
 
 class ForeignVectorEnv(GoalVectorEnv):

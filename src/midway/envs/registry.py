@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from midway.envs.ant_maze import AntMazeVectorEnv
-from midway.envs.foreign import ForeignVectorEnv, described
+from midway.envs.foreign import Foreign, ForeignVectorEnv, described
 from midway.envs.ids import GYM_IDS
 from midway.envs.mazes import MAZES
 from midway.envs.point_maze import PointMazeVectorEnv
@@ -66,33 +66,34 @@ ENVIRONMENTS: dict[str, Entry] = {
 """Every environment by name, in the order of lists."""
 
 
-def entry(name: str) -> Entry:
-    """Return the entry of an environment; other Gymnasium goal environments go by their own id.
+def entry(env: str | Foreign) -> Entry:
+    """Return the entry of an environment, of a foreign one too, by its name or as described.
 
     Raises:
-        ConfigurationError: There is none of this name.
+        ConfigurationError: There is none of this name, or midway cannot use it.
     """
-    if name in ENVIRONMENTS:
-        return ENVIRONMENTS[name]
+    if isinstance(env, Foreign):
+        factory = partial(ForeignVectorEnv, env)
+        return Entry(env.spec.name, env.spec.name, env.rule.description, ("uniform",), factory)
+    if env in ENVIRONMENTS:
+        return ENVIRONMENTS[env]
     try:
-        foreign = described(name)
+        return entry(described(env))
     except UnknownEnvironmentError as error:
         own = ", ".join(ENVIRONMENTS)
         raise ConfigurationError(
             f"{error}; midway's own are {own}, and any goal environment goes by its Gymnasium id "
             "or module:name"
         ) from error
-    factory = partial(ForeignVectorEnv, foreign)
-    return Entry(name, name, foreign.rule.description, ("uniform",), factory)
 
 
 def make_vec(
-    name: str, num_envs: int = 1, task: str = "uniform", num_threads: int = 0
+    name: str | Foreign, num_envs: int = 1, task: str = "uniform", num_threads: int = 0
 ) -> GoalVectorEnv:
     """Return copies of an environment that are stepped together.
 
     Args:
-        name: A name of the registry, such as ``point-u``.
+        name: A name of the registry, such as ``point-u``, or what ``foreign.describe`` returned.
         num_envs: Number of copies.
         task: A task of the environment: what starts and goals are drawn from.
         num_threads: Threads that simulate; 0 chooses. Results do not depend on it.
