@@ -118,6 +118,25 @@ def test_an_ended_environment_must_be_reset_and_others_are_left_alone() -> None:
         env.step(np.zeros((3, 2), np.float32))
 
 
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_who_rests_is_not_stepped_until_it_is_reset(num_threads: int) -> None:
+    env = ForeignVectorEnv(plane(Settings(1e-6), reward="none"), 2, num_threads=num_threads)
+    start = env.reset(seed=0)[0]["achieved_goal"]
+    second = np.array([False, True])
+    env.rest(second)
+    for _ in range(20):
+        observation, _, terminated, truncated, _ = env.step(RIGHT)
+    moved = observation["achieved_goal"] - start
+    np.testing.assert_allclose(moved, [[5, 0], [0, 0]], atol=1e-5)
+    assert truncated.tolist() == [True, False]
+    assert not terminated.any()
+    env.reset(options={"reset_mask": np.array([True, True])})
+    before = env._held["achieved_goal"].copy()
+    env.step(RIGHT)
+    assert (env._held["achieved_goal"] != before)[:, 0].all()
+    env.close()
+
+
 def test_an_end_without_success_is_a_failure() -> None:
     env = ForeignVectorEnv(plane(ends="cliff"), 2)
     env.reset(seed=1)

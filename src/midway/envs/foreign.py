@@ -255,6 +255,15 @@ class ForeignVectorEnv(GoalVectorEnv):
         self._held: dict[str, Array] = {}
         self._newest: Observations = {}
         self._contradictions = 0
+        self._resting = np.zeros(num_envs, np.bool_)
+
+    def rest(self, mask: Bool[Array, " num_envs"]) -> None:
+        """Step these no more until they are reset: simulators of others can be slow.
+
+        They show what they last showed, and their episodes have no further ends.
+        """
+        self._resting |= mask
+        self._ended &= ~mask
 
     def step(self, actions: Array) -> Step:
         """Move every environment by one step, as `GoalVectorEnv.step`.
@@ -268,7 +277,9 @@ class ForeignVectorEnv(GoalVectorEnv):
         # What its info calls success ends no episode as a failure, whatever the rule of the user.
         failed = ended & ~reached & (self._held["word"] != 1) & ~truncated
         truncated = truncated | (self._held["truncated"] == 1) | (ended & ~reached & ~failed)
-        terminated = reached | failed
+        awake = ~self._resting
+        truncated, failed = truncated & awake, failed & awake
+        terminated = (reached | failed) & awake
         self._ended = terminated | truncated
         info |= {"failed": failed.copy(), "_failed": info["_is_success"].copy()}
         return observations, reward, terminated, truncated, info
@@ -295,12 +306,14 @@ class ForeignVectorEnv(GoalVectorEnv):
         mask, seeds = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.int64)
         for copy in copies:
             mask[copy], seeds[copy] = True, self.generators[copy].integers(2**31)
+        self._resting &= ~mask
         if self._workers is not None:
             self._hold(self._workers.reset(mask, seeds))
         elif self._group is not None:
             self._hold(self._group.reset(options={"mask": mask, "seeds": seeds})[0])
 
     def _advance(self, actions: Shaped[Array, "num_envs action_dim"]) -> None:
+        actions = np.where(self._resting[:, None], np.nan, actions).astype(np.float32)
         if self._workers is not None:
             self._hold(self._workers.step(actions))
         elif self._group is not None:

@@ -80,9 +80,12 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
         return self.held, {}
 
     def step(self, actions: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
-        """Move every environment by one step, by actions in [-1, 1]."""
+        """Move every environment by one step, by actions in [-1, 1]; NaN: it rests."""
         scaled = self.low + (np.clip(actions, -1, 1) + 1) / 2 * (self.high - self.low)
         for place, env in enumerate(self.envs):
+            if np.isnan(scaled[place]).any():
+                self._flag(place, False, False, -1)
+                continue
             action = scaled[place].reshape(env.action_space.shape).astype(env.action_space.dtype)
             observation, _, terminated, truncated, info = env.step(action)
             self._hold(place, observation, info, terminated, truncated)
@@ -109,7 +112,9 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
     ) -> None:
         for name, reading in self.readings.items():
             self.held[name][place] = reading.read(observation[name])
-        flags = (*ends, word_of(info)[1])
+        self._flag(place, *ends, word_of(info)[1])
+
+    def _flag(self, place: int, *flags: int) -> None:
         for name, value in zip(FLAGS, flags, strict=True):
             self.held[name][place] = value
 
