@@ -1,14 +1,27 @@
-# Two commands for a fresh Debian machine: `make train` and `make test`. Both create .venv first.
+# The commands of the project on a fresh Debian machine. Each of them creates .venv first.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 RUN ?= runs/point-u
 
-.PHONY: train test format clean
+# Tests that compile little: no agent is created, no run trained, no image encoded.
+QUICK := tests/test_architecture.py tests/test_dependencies.py tests/test_functional.py \
+	tests/networks/test_critics.py tests/networks/test_mlp.py tests/networks/test_policies.py \
+	tests/replay/test_replay_properties.py tests/replay/test_replay_uniform.py
+
+# Two workers share the files, so that a file trains its small runs once.
+PYTEST := $(BIN)/pytest --numprocesses auto --dist loadfile
+COVERAGE := --cov=midway
+
+.PHONY: train check test test-all test-lowest lint format clean
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	touch $@
+
+$(VENV)/installed-extras: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --editable '.[dev,cluster]'
 	touch $@
 
@@ -19,15 +32,35 @@ train: $(VENV)/installed
 	$(BIN)/midway evaluate $(RUN)
 	$(BIN)/midway report $(RUN)
 
-test: $(VENV)/installed
+# Before every commit: under a minute.
+check: lint
+	$(PYTEST) $(QUICK)
+
+# Everything that needs no extra.
+test: lint
+	$(PYTEST) $(COVERAGE) -m "not extra"
+
+# Everything. Chromium and Xvfb are Debian's: .ci/run installs them.
+test-all: $(VENV)/installed-extras lint
+	$(PYTEST) $(COVERAGE)
+
+# The quick tests with the oldest releases that pyproject.toml allows, in a venv of their own.
+test-lowest:
+	$(PYTHON) -m venv $(VENV)-lowest
+	$(VENV)-lowest/bin/python -m pip install --quiet --upgrade pip
+	$(VENV)-lowest/bin/python .ci/lowest.py > $(VENV)-lowest/constraints.txt
+	$(VENV)-lowest/bin/python -m pip install --quiet --editable '.[dev,cluster]' \
+		--constraint $(VENV)-lowest/constraints.txt
+	$(VENV)-lowest/bin/pytest --numprocesses auto --dist loadfile $(QUICK) tests/envs/test_mazes.py tests/envs/test_point_maze.py
+
+lint: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/pytest --numprocesses auto --dist loadfile
 
 format: $(VENV)/installed
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(VENV)-lowest

@@ -12,8 +12,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from midway.training import api
 from midway.training.folder import RunFolder
+
+from midway.training import api
 from midway.training.progress import Silent
 
 RESULTS = Path(__file__).parent / "results" / "autoencoder"

@@ -1,11 +1,28 @@
-"""Settings of every test."""
+"""Settings of every test: what is compiled, kept in memory, waited for and skipped."""
 
+import gc
 import os
+import resource
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import hypothesis
+import jax
 import pytest
 
-from midway.training.compilation import use_compilation_cache
+from midway.training.compilation import give_back_memory, use_compilation_cache
+
+# No example is timed: a test's time limit (pyproject.toml) is the only clock.
+hypothesis.settings.register_profile(
+    "midway", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("midway")
+
+MAY_SKIP = "MIDWAY_TESTS_MAY_SKIP"
+"""Environment variable: with ``no``, as in CI, a skipped test fails the session."""
+
+peaks = pytest.StashKey[list[int]]()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -15,3 +32,43 @@ def compiled_programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     os.environ["XDG_CACHE_HOME"] = str(folder)
     use_compilation_cache()
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def memory_of_one_file(compiled_programs: Path) -> Iterator[None]:
+    """Let go of a file's compiled programs when it is through: they would pile up to GiBs."""
+    yield
+    jax.clear_caches()
+    gc.collect()
+    give_back_memory()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[peaks] = []
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Collect what a worker said at its end; one that crashed said nothing."""
+    node.config.stash[peaks] += getattr(node, "workeroutput", {}).get("peaks", [])
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Note the most memory that this process has had, if it ran tests itself."""
+    config = session.config
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+    if hasattr(config, "workeroutput"):
+        config.workeroutput["peaks"] = [peak]
+    elif not config.stash[peaks]:
+        config.stash[peaks].append(peak)
+    reporter = config.pluginmanager.get_plugin("terminalreporter")
+    skipped = reporter.stats.get("skipped") if reporter else None
+    if skipped and os.environ.get(MAY_SKIP) == "no":
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    stats, found = terminalreporter.stats, terminalreporter.config.stash[peaks]
+    terminalreporter.write_line(f"most memory of a test process: {max(found)} MiB")
+    if stats.get("skipped") and os.environ.get(MAY_SKIP) == "no":
+        terminalreporter.write_line("no test may be skipped here, and some were", red=True)

@@ -8,30 +8,35 @@ from pathlib import Path
 import pytest
 
 import midway
+from midway.agents.registry import AGENTS
+from midway.envs.registry import ENVIRONMENTS
 
 SOURCE = Path(midway.__file__).parent
 FILES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init__.py")
 """All but the public face, ``midway/__init__.py``, which may name anything."""
 
 FLOORS = (
-    {"types", "functional"},
+    {"types"},
+    {"settings", "functional", "tables", "agent"},
     {"networks", "replay", "envs", "planning"},
     {"agents"},
-    {"training", "presets", "api"},
-    {"reports", "cluster"},
+    {"training"},
+    {"runs", "presets"},
+    {"api"},
+    {"reports", "cluster", "bench"},
     {"cli"},
 )
+"""The floors from below; the lowest of the design is two here, for all of it reads the types."""
+
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
+
+AGENT_FLOORS = ({"ris", "sac", "tdm", "crl"}, {"leap"}, {"registry"})
+"""The same within agents/: LEAP is built on TDM, and the registry names them all."""
+
+AGENT_FLOOR = {agent: level for level, agents in enumerate(AGENT_FLOORS) for agent in agents}
 
 FORBIDDEN_IMPORTS = {"gym", "mujoco_py", "d4rl", "pickle"}
 FORBIDDEN_NAME = re.compile(r"^_*(tau|alpha|lambda)_*$", re.IGNORECASE)
-
-# Floor 3 has an order of its own: the modules that build a run out of a configuration look up its
-# preset, and a preset is a training configuration.
-API = {"api", "training.api"}
-
-# The agents are siblings that share a room: each file stands alone, but for these.
-AGENTS_MAY = {("leap", "tdm")}
 
 
 def name_of(path: Path) -> str:
@@ -71,21 +76,14 @@ def violations(module: str, imported: Iterator[str]) -> Iterator[str]:
             yield f"{module} imports {target}, which is on no floor"
         elif there[0] == room:
             yield from _violations_between_agents(module, there)
-        elif FLOOR[there[0]] >= FLOOR[room] and not _is_api_order(module, there[0]):
+        elif FLOOR[there[0]] >= FLOOR[room]:
             yield f"{module} (floor {FLOOR[room]}) imports {target} (floor {FLOOR[there[0]]})"
-
-
-def _is_api_order(module: str, room: str) -> bool:
-    return (module in API and room in {"presets", "training"}) or (module, room) == (
-        "presets",
-        "training",
-    )
 
 
 def _violations_between_agents(module: str, there: list[str]) -> Iterator[str]:
     room, _, importer = module.partition(".")
-    if room == "agents" and importer != "registry" and (importer, there[1]) not in AGENTS_MAY:
-        yield f"{module} imports its sibling {there[1]}"
+    if room == "agents" and AGENT_FLOOR[there[1]] >= AGENT_FLOOR[importer]:
+        yield f"{module} imports {there[1]}, which is not below it"
 
 
 def identifiers(tree: ast.AST) -> Iterator[tuple[str, int]]:
@@ -110,7 +108,10 @@ def test_the_checks_below_see_the_package():
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_every_module_stands_on_a_floor(path):
-    assert name_of(path).split(".")[0] in FLOOR
+    room, *parts = name_of(path).split(".")
+    assert room in FLOOR
+    if room == "agents" and parts:
+        assert parts[0] in AGENT_FLOOR
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
@@ -138,11 +139,14 @@ def _modules_of(imported: Iterator[str], modules: set[str]) -> Iterator[str]:
             yield name
 
 
-@pytest.mark.parametrize("module", ["training.loop", "training.step", "training.collect"])
+LOOP = ["arrays", "collect", "evaluate", "freeze", "loop", "seeds", "state", "step"]
+
+
+@pytest.mark.parametrize("module", [f"training.{name}" for name in LOOP])
 def test_the_loop_knows_neither_agents_nor_environments(module):
     path = SOURCE.joinpath(*module.split(".")).with_suffix(".py")
     rooms = {target.split(".")[1] for target in imports_of(path) if target.startswith("midway.")}
-    assert rooms <= {"types", "functional", "replay", "training"}
+    assert rooms <= {"types", "functional", "agent", "tables", "replay", "training"}
 
 
 @pytest.mark.parametrize("path", [*FILES, SOURCE / "__init__.py"], ids=name_of)
@@ -175,6 +179,15 @@ def test_no_symbol_of_the_papers_is_an_identifier(path):
         ("agents.tdm", "from midway.agents.leap import Config"),
         ("training.loop", "def run():\n    from midway.cli.main import main"),
         ("training.loop", "from midway.presets import PAPER"),
+        ("training.loop", "from midway.runs.folder import RunFolder"),
+        ("runs.policy", "from midway import presets"),
+        ("presets", "from midway.runs.folder import RunConfig"),
+        ("runs.folder", "from midway import api"),
+        ("bench.pieces", "from midway.reports import page"),
+        ("types", "from midway.settings import check"),
+        ("settings", "from midway.tables import read"),
+        ("agent", "from midway import functional"),
+        ("agents.leap", "from midway.agents import registry"),
         ("presets", "from midway.reports import page"),
         ("reports.page", "from midway.cluster import sweep"),
         ("agents.ris", "from midway import make_vec"),
@@ -196,7 +209,13 @@ def test_an_import_that_does_not_point_down_is_found(module, line):
         ("agents.ris", "import numpy as np"),
         ("cli.main", "from midway.training.loop import train"),
         ("presets", "from midway.training.config import TrainConfig"),
-        ("training.api", "from midway import presets"),
+        ("settings", "from midway.types import ConfigurationError"),
+        ("agent", "from midway.types import Batch"),
+        ("tables", "from midway.types import ConfigurationError"),
+        ("runs.policy", "from midway.training import freeze"),
+        ("api", "from midway import presets"),
+        ("bench.pieces", "from midway import api"),
+        ("cli.main", "from midway.bench import pieces"),
     ],
 )
 def test_an_import_that_points_down_is_allowed(module, line):
@@ -209,3 +228,81 @@ def test_a_symbol_is_found_wherever_it_is_used():
         assert any(FORBIDDEN_NAME.match(name) for name, _ in identifiers(ast.parse(line)))
     for line in ("lambda x: x", "target = 1", "alphabet = 1", "plot(alpha=0.5)"):
         assert not any(FORBIDDEN_NAME.match(name) for name, _ in identifiers(ast.parse(line)))
+
+
+# --- nobody asks for a name -----------------------------------------------------------------------
+
+AGENT_NAMES = {*AGENTS, "crl"}
+MAY_NAME_AGENTS = {"agents.registry", "presets"}
+MAY_DEFAULT_TO_AGENTS = {"api", "cli", "bench"}
+"""Rooms whose calls and default arguments may choose an agent; none may compare one."""
+
+GUESS = re.compile(rf"^({'|'.join({e.family for e in ENVIRONMENTS.values()})})(-.*)?$")
+
+
+def names_of_agents(module: str, tree: ast.AST) -> Iterator[str]:
+    """Yield a line for every agent's name that the module must not know."""
+    if module in MAY_NAME_AGENTS:
+        return
+    allowed: set[ast.AST] = set()
+    if module.split(".")[0] in MAY_DEFAULT_TO_AGENTS:
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                given = [*node.args.defaults, *(d for d in node.args.kw_defaults if d)]
+                allowed |= {part for value in given for part in ast.walk(value)}
+            elif isinstance(node, ast.Call):
+                allowed |= set(node.args)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and node.value in AGENT_NAMES and node not in allowed:
+            yield f"line {node.lineno}: {node.value!r}"
+
+
+def guesses(tree: ast.AST) -> Iterator[str]:
+    """Yield a line for each guess at an environment from parts of its name."""
+    names = {*ENVIRONMENTS, *(e.family for e in ENVIRONMENTS.values())}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            texts = [a.value for a in node.args if isinstance(a, ast.Constant)]
+            cut = node.func.attr in {"partition", "rpartition", "split"} and "-" in texts
+            begun = node.func.attr in {"startswith", "removeprefix"} and any(
+                isinstance(text, str) and GUESS.match(text) for text in texts
+            )
+            if cut or begun:
+                yield f"line {node.lineno}: {ast.unparse(node)}"
+        elif isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            for part in (part for side in sides for part in ast.walk(side)):
+                if isinstance(part, ast.Constant) and part.value in names:
+                    yield f"line {node.lineno}: {ast.unparse(node)}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_nobody_asks_for_the_name_of_an_agent(path):
+    assert list(names_of_agents(name_of(path), ast.parse(path.read_text()))) == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_nothing_is_guessed_from_the_name_of_an_environment(path):
+    assert list(guesses(ast.parse(path.read_text()))) == []
+
+
+def test_a_name_of_an_agent_is_found():
+    for line in ('if agent == "sac": pass', 'COLOURS = {"ris": 1}', 'x in ("tdm", "leap")'):
+        assert list(names_of_agents("reports.style", ast.parse(line)))
+        assert list(names_of_agents("api", ast.parse(line)))
+        assert not list(names_of_agents("presets", ast.parse(line)))
+    default = ast.parse('def train(agent="ris", agents=("ris", "sac")): pass')
+    assert not list(names_of_agents("cli.main", default))
+    assert list(names_of_agents("training.loop", default))
+
+
+def test_a_guess_at_an_environment_is_found():
+    for line in (
+        'env.partition("-")',
+        'env.startswith("ant-")',
+        'env == "push"',
+        'e.family == "ant"',
+    ):
+        assert list(guesses(ast.parse(line)))
+    for line in ('line.partition(":")', 'name.startswith("distance_")', 'x == "hard"'):
+        assert not list(guesses(ast.parse(line)))

@@ -190,26 +190,26 @@ def test_kl_estimate_averages_to_the_divergence_of_two_gaussians():
 # --- copies ---------------------------------------------------------------------------------------
 
 
-def test_polyak_update_by_hand():
-    moved = functional.polyak_update({"w": array(10)}, {"w": array(2)}, 0.005)
+def test_target_update_by_hand():
+    moved = functional.target_update({"w": array(10)}, {"w": array(2)}, 0.005)
     assert moved["w"][0] == pytest.approx(0.005 * 10 + 0.995 * 2)
 
 
 @quick
 @given(floats((BATCH,), -100, 100), floats((BATCH,), -100, 100), st.floats(0, 1))
-def test_polyak_update_reaches_both_endpoints_and_stays_between(online, target, rate):
+def test_target_update_reaches_both_endpoints_and_stays_between(online, target, rate):
     online, target = jnp.asarray(online), jnp.asarray(target)
-    np.testing.assert_array_equal(functional.polyak_update(online, target, 0.0), target)
-    np.testing.assert_array_equal(functional.polyak_update(online, target, 1.0), online)
-    moved = functional.polyak_update(online, target, rate)
+    np.testing.assert_array_equal(functional.target_update(online, target, 0.0), target)
+    np.testing.assert_array_equal(functional.target_update(online, target, 1.0), online)
+    moved = functional.target_update(online, target, rate)
     low, high = jnp.minimum(online, target), jnp.maximum(online, target)
     assert bool(((moved >= low - 1e-4) & (moved <= high + 1e-4)).all())
 
 
-def test_polyak_update_leaves_anything_but_floats_alone():
+def test_target_update_leaves_anything_but_floats_alone():
     online = {"count": jnp.asarray(3), "name": "online", "w": array(1)}
     target = {"count": jnp.asarray(5), "name": "target", "w": array(0)}
-    moved = functional.polyak_update(online, target, 0.5)
+    moved = functional.target_update(online, target, 0.5)
     assert moved["count"] == 5
     assert moved["name"] == "target"
     assert moved["w"][0] == 0.5

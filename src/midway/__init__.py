@@ -3,16 +3,16 @@
 import importlib
 from typing import Any
 
-from midway.envs.ids import register_ids
+from midway.envs.registry import register_ids
 
 register_ids()
 
 
 _PUBLIC = {
-    "train": "midway.training.api",
-    "resume": "midway.training.api",
-    "load": "midway.training.api",
-    "evaluate": "midway.training.api",
+    "train": "midway.api",
+    "resume": "midway.api",
+    "load": "midway.api",
+    "evaluate": "midway.api",
     "make_vec": "midway.envs.registry",
 }
 

@@ -20,7 +20,7 @@ def td_target(
     reward: Float[Array, " B"],
     terminated: Float[Array, " B"],
     next_value: Float[Array, " B"],
-    discount: float,
+    discount: float | Float[Array, " B"],
 ) -> Float[Array, " B"]:
     """Return the target of Q, r + γ (1 - terminated) V(s', g), shape ``(B,)``."""
     return reward + discount * (1 - terminated) * next_value
@@ -29,6 +29,11 @@ def td_target(
 def critic_loss(q: Float[Array, "2 B"], target: Float[Array, " B"]) -> Float[Array, ""]:
     """Return half the squared error, summed over the critics, averaged over the batch."""
     return 0.5 * ((q - target) ** 2).sum(0).mean()
+
+
+def value_bound(discount: float) -> float:
+    """Return the largest number of discounted steps, 1 / (1 - γ): values lie in [-bound, 0]."""
+    return 1 / (1 - discount)
 
 
 def subgoal_cost(
@@ -81,8 +86,8 @@ def kl_policy_loss(
     return (kl_weight * kl - q).mean()
 
 
-def polyak_update(online: Tree, target: Tree, target_update_rate: float) -> Tree:
-    """Return τ online + (1 - τ) target for every array of two equal trees."""
+def target_update(online: Tree, target: Tree, target_update_rate: float) -> Tree:
+    """Return τ online + (1 - τ) target (appendix B): an exponential moving average."""
     moved: Tree = jax.tree.map(
         lambda o, t: (
             target_update_rate * o + (1 - target_update_rate) * t if eqx.is_inexact_array(t) else t

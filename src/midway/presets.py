@@ -1,263 +1,400 @@
-"""Values for each agent and environment: ``paper`` as published, ``quick`` for two cores.
+"""Presets: an ordered table of rules; later ones win.
 
-Sources: [1] table 1, [2] table 2, [B] appendix B, [D] appendix D, [code] the original code of RIS
-where the paper is silent, [LEAP] that of LEAP, [curves] measured here with ``benchmarks/run.py``,
-[leap.md] measured here, see ``docs/algorithms/leap.md``, [trials] single runs, see
-``benchmarks/README.md``.
+``paper`` is as published, ``quick`` is for two processor cores.
+
+The defaults of the configurations are the paper's ant navigation and stand there, with their
+sources. The rules say what differs by environment and agent.
 """
 
-from dataclasses import fields, replace
-from typing import Any, Literal, TypeAlias, get_args
+import fnmatch
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
 
-from midway.agents import registry
+from midway import settings
+from midway.agents import registry as agents
+from midway.envs import registry as environments
+from midway.envs.registry import Declaration
 from midway.networks.mlp import fastest_precision
 from midway.training.config import TrainConfig
 from midway.types import ConfigurationError, RelabelMix
 
-PresetName: TypeAlias = Literal["paper", "quick"]
+Values: TypeAlias = Mapping[str, Any]
 
-PAPER = TrainConfig(
-    steps=1_000_000,  # [D]
-    num_envs=1,  # [code]
-    random_steps=10_000,  # [code]
-    updates_per_step=1.0,  # [1]
-    batch_size=2048,  # [1]
-    replay_capacity=1_000_000,  # [1]
-    relabel=RelabelMix(own=0.2, random=0.4, future=0.4),  # [B]
-    evaluate_every=10_000,
-    evaluation_episodes=20,  # [code] has 5, too few to tell curves apart
-    log_every=1_000,
-    checkpoint_every=50_000,
-)
-"""The loop of ant navigation. The point mazes are not in the paper and take the same values."""
 
-RIS_PAPER: dict[str, Any] = {
-    "hidden": (256, 256),  # [1]
-    "discount": 0.99,  # [1] γ
-    "target_update_rate": 5e-3,  # [1] τ
-    "critic_learning_rate": 1e-3,  # [1]
-    "policy_learning_rate": 1e-3,  # [1]
-    "subgoal_learning_rate": 1e-4,  # [1]
-    "encoder_learning_rate": 1e-4,  # [code]
-    "kl_weight": 0.1,  # [1] α
-    "advantage_temperature": 0.1,  # [1] λ
-    "num_subgoals": 10,  # [B] I
-    "epsilon": 1e-16,  # [1] ε
-}
-SAC_PAPER: dict[str, Any] = {
-    "hidden": (256, 256),  # [1]
-    "discount": 0.99,  # [1] γ
-    "target_update_rate": 5e-3,  # [1] τ
-    "critic_learning_rate": 1e-3,  # [1]
-    "policy_learning_rate": 1e-3,  # [1]
-    "entropy_learning_rate": 1e-3,  # as the policy's
-    "encoder_learning_rate": 1e-4,  # [code] of RIS
-}
-LEAP_PAPER: dict[str, Any] = {
-    "hidden": (400, 300),  # [D]
-    "max_steps_left": 50,  # [2]
-    "reward_scale": 10.0,  # [LEAP]
-    "target_update_rate": 5e-3,  # [LEAP]
-    "policy_delay": 2,  # [LEAP]
-    "critic_learning_rate": 1e-3,  # [LEAP]
-    "policy_learning_rate": 1e-3,  # [LEAP]
-    "encoder_learning_rate": 1e-4,  # of RIS; for tdm on images
-    "target_noise": 0.2,  # [LEAP]
-    "target_noise_bound": 0.5,  # [LEAP]
-    "saturation_weight": 1.0,  # [LEAP] ant
-    "saturation_bound": 20.0,  # [LEAP] ant
-    "exploration_noise": 0.3,  # [LEAP] σ
-    "exploration_reversion": 0.15,  # [LEAP] θ
-    "num_subgoals": 11,  # [2]
-    "latent_size": 8,  # [D] ant
-    "vae_hidden": (64, 128, 64),  # [D]
-    "vae_kl_weight": 1e-4,  # [leap.md] [LEAP] has 1e-2, which loses the position
-    "vae_learning_rate": 1e-3,  # [LEAP]
-    "vae_states": 50_000,  # [LEAP]
-    "vae_random_actions": 0,  # [leap.md] [LEAP] has 1, which loses the position
-    "vae_rounds": 2_500,  # [LEAP]
-    "vae_updates": 100,  # [LEAP]
-    "vae_batch_size": 128,  # [LEAP]
-    "plan_samples": 10_000,  # [LEAP] ant
-    "plan_iterations": 50,  # [LEAP] ant
-    "plan_elites": (0.25, 0.01),  # [LEAP] ant
-    "plan_std": 1.5,  # [LEAP]
-    "prior_weight": 0.1,  # [LEAP] ant
-}
-"""LEAP, and TDM as far as it has these."""
+@dataclass(frozen=True)
+class Rule:
+    """Values for some presets, environments and agents.
 
-PUSH_PAPER: dict[str, Any] = {
-    "policy_learning_rate": 1e-4,  # [1]
-    "entropy_learning_rate": 1e-4,  # as the policy's
-    "epsilon": 1e-4,  # [1] ε
-}
-"""What differs on the arm and puck, for ``ris`` and ``sac``."""
+    Attributes:
+        preset: Name of the preset; ``*`` for each.
+        values: Values by the names of the settings.
+        source: Where they come from.
+        env: Patterns of environment names, separated by spaces; a name without a pattern's
+            wildcard is that environment alone.
+        agent: Patterns of agent names, separated by spaces.
+        deviates: Why values of ``paper`` are not the paper's; nothing where they are.
+    """
 
-HYPERPARAMETERS = {"ris": RIS_PAPER, "sac": SAC_PAPER, "tdm": LEAP_PAPER, "leap": LEAP_PAPER}
+    preset: str
+    values: Values
+    source: str
+    env: str = "*"
+    agent: str = "*"
+    deviates: str = ""
 
-LEAP_TASKS: dict[str, dict[str, Any]] = {
-    "ant": {"num_rewards": 17},  # [LEAP] positions
-    "ant-pi": {"max_steps_left": 75},  # [2]
-    "ant-omega": {"max_steps_left": 100},  # [2]
-    "push": {
-        "max_steps_left": 25,  # [2]
-        "num_rewards": 4,  # [LEAP] hand and puck
-        "saturation_weight": 0.0,  # [LEAP]
-        "num_subgoals": 3,  # [2]
-        "latent_size": 16,  # [D]
-        "vae_kl_weight": 2.5,  # [LEAP]
-        "vae_random_actions": 4,  # [LEAP]
-        "plan_samples": 1_000,  # [LEAP]
-        "plan_iterations": 15,  # [LEAP]
-        "plan_elites": (0.05,),  # [LEAP]
-        "prior_weight": 1e-3,  # [LEAP]
-    },
-    "point": {  # not in the paper: [leap.md]
-        "max_steps_left": 14,
-        "num_rewards": 2,
-        "num_subgoals": 9,
-        "latent_size": 2,
-        "vae_kl_weight": 1e-3,
-    },
-}
-"""What differs by family of environments or environment, for ``tdm`` and ``leap``."""
+    def applies(self, preset: str, env: Declaration, agent: str) -> bool:
+        """Return whether the rule is one of this preset, environment and agent."""
+        return (
+            self.preset in ("*", preset)
+            and any(fnmatch.fnmatchcase(env.name, pattern) for pattern in self.env.split())
+            and any(fnmatch.fnmatchcase(agent, pattern) for pattern in self.agent.split())
+        )
 
-LEAP_LOOP: dict[str, Any] = {
-    "random_steps": 3_000,  # [LEAP] the first update
-    "relabel": RelabelMix(own=0.4, random=0.2, future=0.4),  # [LEAP] own and fresh goals as one
-}
-PAPER_LOOPS: dict[str, dict[str, Any]] = {
-    "tdm": LEAP_LOOP,
-    "leap": LEAP_LOOP | {"evaluate_every": 250_000},  # an episode of the ant is 11 plans
-}
-"""What differs in the loop by agent."""
 
-PUSH_LOOP: dict[str, Any] = {
-    "batch_size": 256,  # [1]
-    "replay_capacity": 102_000,  # [1] 100,000 transitions in episodes of 100
-}
-"""What differs in the loop on the arm and puck; [LEAP] has 2,048 and a million, on states."""
+class Source(NamedTuple):
+    """Where a value comes from, and why it is not the paper's if it should be."""
 
-QUICK = {
-    "point": replace(
-        PAPER,
-        steps=32_000,  # [curves]
-        num_envs=16,
-        random_steps=1_000,
-        updates_per_step=0.5,  # [curves] steps are cheap here, and fresh ones help
-        batch_size=256,  # [curves]
-        replay_capacity=200_000,
-        evaluate_every=4_000,
-        evaluation_episodes=100,
-        log_every=1_000,
-        checkpoint_every=16_000,
+    source: str
+    deviates: str = ""
+
+
+class Resolved(NamedTuple):
+    """What a preset says of an environment and an agent.
+
+    Attributes:
+        train: Settings of the loop.
+        hyperparameters: The agent's configuration.
+        sources: Where each value comes from, by its name.
+    """
+
+    train: TrainConfig
+    hyperparameters: Any
+    sources: dict[str, Source]
+
+
+HINDSIGHT_OF_LEAP = RelabelMix(own=0.4, random=0.2, future=0.4)
+DISCOUNTED_FUTURE = RelabelMix(own=0.0, random=0.0, future=1.0, future_discount=0.99)
+
+PAPER: tuple[Rule, ...] = (
+    Rule(
+        "*",
+        {"policy_learning_rate": 1e-4, "epsilon": 1e-4},
+        "table 1",
+        env="push push-state",
+        agent="ris",
     ),
-    "ant": replace(
-        PAPER,
-        steps=300_000,  # [curves] RIS solves the U-shaped maze, in about 75 minutes
-        num_envs=8,
-        updates_per_step=1.0,  # [curves] many small batches
-        batch_size=256,
-        replay_capacity=500_000,
-        evaluate_every=25_000,
-        log_every=2_000,
-        checkpoint_every=25_000,
+    Rule(
+        "*",
+        {"policy_learning_rate": 1e-4, "entropy_learning_rate": 1e-4},
+        "table 1",
+        env="push push-state",
+        agent="sac",
     ),
-}
-QUICK["point-omega"] = replace(QUICK["point"], steps=48_000)  # [curves] the longest way
-QUICK["push"] = replace(
-    PAPER,
-    steps=400_000,  # [curves]
-    num_envs=8,
-    updates_per_step=0.25,  # [trials] steps are cheaper than updates, and each shows new images
-    batch_size=256,
-    encoder_batch_size=64,  # [trials] images take most of the time
-    replay_capacity=102_000,
-    evaluate_every=30_000,
-    evaluation_episodes=50,
-    log_every=2_000,
-    checkpoint_every=30_000,
-    task="near",  # [code] hands that start beside the puck push it now and then
+    Rule(
+        "*",
+        {"batch_size": 256, "replay_capacity": 102_000},
+        "table 1: 100,000 transitions in episodes of 100",
+        env="push push-state",
+    ),
+    Rule("*", {"relabel": HINDSIGHT_OF_LEAP}, "code of LEAP", agent="tdm leap"),
+    Rule("paper", {"random_steps": 3_000}, "code of LEAP: the first update", agent="tdm leap"),
+    Rule(
+        "paper",
+        {"evaluate_every": 250_000},
+        "ours",
+        agent="leap",
+        deviates="an episode of the ant is 11 plans",
+    ),
+    Rule("*", {"num_rewards": 17}, "code of LEAP: positions", env="ant-*", agent="tdm leap"),
+    Rule("*", {"max_steps_left": 75}, "table 2", env="ant-pi", agent="tdm leap"),
+    Rule("*", {"max_steps_left": 100}, "table 2", env="ant-omega", agent="tdm leap"),
+    Rule("*", {"max_steps_left": 25}, "table 2", env="push push-state", agent="tdm leap"),
+    Rule(
+        "*",
+        {"num_rewards": 4, "saturation_weight": 0.0},
+        "code of LEAP: hand and puck",
+        env="push push-state",
+        agent="tdm leap",
+    ),
+    Rule("*", {"num_subgoals": 3}, "table 2", env="push push-state", agent="leap"),
+    Rule("*", {"latent_size": 16}, "appendix D", env="push push-state", agent="leap"),
+    Rule(
+        "*",
+        {
+            "vae_kl_weight": 2.5,
+            "vae_random_actions": 4,
+            "plan_samples": 1_000,
+            "plan_iterations": 15,
+            "plan_elites": (0.05,),
+            "prior_weight": 1e-3,
+        },
+        "code of LEAP",
+        env="push push-state",
+        agent="leap",
+    ),
+    Rule(
+        "*",
+        {"max_steps_left": 14, "num_rewards": 2},
+        "leap.md",
+        env="point-*",
+        agent="tdm leap",
+        deviates="point mazes are not in the paper",
+    ),
+    Rule(
+        "*",
+        {"num_subgoals": 9, "latent_size": 2, "vae_kl_weight": 1e-3},
+        "leap.md",
+        env="point-*",
+        agent="leap",
+        deviates="point mazes are not in the paper",
+    ),
+    Rule("*", {"relabel": DISCOUNTED_FUTURE}, "CRL", agent="crl"),
 )
-QUICK["push-state"] = replace(
-    QUICK["push"],
-    steps=60_000,  # [curves]
-    random_steps=5_000,
-    updates_per_step=1.0,
-    evaluate_every=10_000,
-    checkpoint_every=20_000,
+"""What the paper says of other tasks than ant navigation; ``quick`` begins with it."""
+
+QUICK: tuple[Rule, ...] = (
+    Rule(
+        "quick",
+        {
+            "num_envs": 16,
+            "random_steps": 1_000,
+            "updates_per_step": 0.5,
+            "batch_size": 256,
+            "replay_capacity": 200_000,
+            "evaluate_every": 4_000,
+            "evaluation_episodes": 100,
+            "log_every": 1_000,
+            "checkpoint_every": 16_000,
+        },
+        "curves of the point mazes: steps are cheap there, and fresh ones help",
+    ),
+    Rule(
+        "quick",
+        {
+            "num_envs": 8,
+            "random_steps": 10_000,
+            "updates_per_step": 1.0,
+            "replay_capacity": 500_000,
+            "evaluate_every": 25_000,
+            "evaluation_episodes": 20,
+            "log_every": 2_000,
+            "checkpoint_every": 25_000,
+        },
+        "curves of ant-u: many small batches",
+        env="ant-*",
+    ),
+    Rule(
+        "quick",
+        {
+            "num_envs": 16,
+            "updates_per_step": 0.5,
+            "collect_limit": 300,
+            "evaluate_every": 16_000,
+            "checkpoint_every": 48_000,
+        },
+        "trials of ant-u: steps are cheaper than updates",
+        env="ant-*",
+        agent="ris sac",
+    ),
+    Rule(
+        "quick",
+        {
+            "n_step": 5,
+            "clip_targets": True,
+            "hindsight_bound": True,
+            "unreached_goals": True,
+            "num_critics": 1,
+            "layer_norm": True,
+            "normalise": True,
+            "goal_inputs": "relative",
+            "policy_every": 2,
+        },
+        "trials of ant-u: beyond the paper",
+        env="ant-*",
+        agent="ris sac",
+    ),
+    Rule(
+        "quick",
+        {
+            "num_subgoals": 4,
+            "subgoal_every": 4,
+            "candidates_per_pair": 8,
+            "advantage_temperature": 2.0,
+        },
+        "trials of ant-u: beyond the paper",
+        env="ant-*",
+        agent="ris",
+    ),
+    Rule(
+        "quick",
+        {
+            "num_envs": 8,
+            "random_steps": 10_000,
+            "updates_per_step": 0.25,
+            "encoder_batch_size": 64,
+            "replay_capacity": 102_000,
+            "evaluate_every": 30_000,
+            "evaluation_episodes": 50,
+            "log_every": 2_000,
+            "checkpoint_every": 30_000,
+            "task": "near",
+        },
+        "trials of push: hands that start beside the puck push it now and then",
+        env="push push-state",
+    ),
+    Rule(
+        "quick",
+        {
+            "random_steps": 5_000,
+            "updates_per_step": 1.0,
+            "evaluate_every": 10_000,
+            "checkpoint_every": 20_000,
+        },
+        "curves of push-state",
+        env="push-state",
+    ),
+    Rule(
+        "quick",
+        {"freeze_encoder_after": 15_000},
+        "trials of push: policies improve once features stay what they are",
+        env="push",
+        agent="ris sac",
+    ),
+    Rule(
+        "quick",
+        {"policy_learning_rate": 1e-3, "encoder_learning_rate": 3e-4, "random_shift": 4},
+        "trials of push: 8 pixels are 5.7 cm, more than a goal may be missed by",
+        env="push push-state",
+        agent="ris sac",
+    ),
+    Rule(
+        "quick",
+        {"subgoal_learning_rate": 1e-3},
+        "curves of the point mazes: fewer updates than the paper",
+        env="point-*",
+        agent="ris",
+    ),
+    Rule("quick", {"evaluate_every": 16_000}, "leap.md: evaluations plan", agent="leap"),
+    Rule("quick", {"evaluate_every": 75_000}, "leap.md", env="ant-*", agent="leap"),
+    Rule("quick", {"evaluate_every": 8_000}, "leap.md", env="point-*", agent="leap"),
+    Rule(
+        "quick",
+        {"vae_rounds": 300, "plan_samples": 1_000, "plan_iterations": 20},
+        "leap.md",
+        agent="leap",
+    ),
+    Rule(
+        "quick",
+        {
+            "vae_states": 10_000,
+            "vae_rounds": 30,
+            "plan_samples": 300,
+            "plan_iterations": 10,
+            "evaluation_episodes": 30,
+        },
+        "leap.md",
+        env="push push-state",
+        agent="leap",
+    ),
+    Rule(
+        "quick",
+        {"hidden": (256, 256), "target_update_rate": 0.02},
+        "leap.md",
+        env="point-*",
+        agent="tdm leap",
+    ),
+    Rule(
+        "quick",
+        {"vae_states": 5_000, "vae_rounds": 100, "plan_samples": 256, "plan_iterations": 15},
+        "leap.md",
+        env="point-*",
+        agent="leap",
+    ),
 )
-"""The loop by environment or family of environments; others take the point's."""
+"""What two processor cores change."""
 
-PUSH_QUICK: dict[str, Any] = {
-    "policy_learning_rate": 1e-3,  # [curves] the ant's
-    "encoder_learning_rate": 3e-4,
-    "encoder_updates": 15_000,  # [trials] policies improve once codes stay what they are
-    "image_translation": 4,  # [trials] 8 are 5.7 cm, more than a goal may be missed by
-}
-LEAP_QUICK = {"vae_rounds": 300, "plan_samples": 1_000, "plan_iterations": 20}  # [leap.md]
-LEAP_QUICK_POINT: dict[str, Any] = {  # [leap.md]
-    "hidden": (256, 256),
-    "target_update_rate": 0.02,
-    "vae_states": 5_000,
-    "vae_rounds": 100,
-    "plan_samples": 256,
-    "plan_iterations": 15,
-}
-QUICK_HYPERPARAMETERS: dict[tuple[str, str], dict[str, Any]] = {
-    ("point", "ris"): {"subgoal_learning_rate": 1e-3},  # [curves] fewer updates than the paper
-    ("push", "ris"): PUSH_QUICK,
-    ("push", "sac"): PUSH_QUICK,
-    ("any", "leap"): LEAP_QUICK,
-    ("push", "leap"): {
-        "vae_states": 10_000,
-        "vae_rounds": 30,
-        "plan_samples": 300,
-        "plan_iterations": 10,
-    },
-    ("point", "tdm"): LEAP_QUICK_POINT,
-    ("point", "leap"): LEAP_QUICK_POINT,
-}
-"""What ``quick`` changes in an agent, by family of environments and agent."""
-
-QUICK_LOOPS: dict[tuple[str, str], dict[str, Any]] = {
-    ("any", "tdm"): {"relabel": LEAP_LOOP["relabel"]},
-    ("any", "leap"): {"relabel": LEAP_LOOP["relabel"], "evaluate_every": 16_000},
-    ("ant", "leap"): {"evaluate_every": 75_000},
-    ("push", "leap"): {"evaluation_episodes": 30},  # [LEAP]
-    ("point", "leap"): {"evaluate_every": 8_000},
-}
-"""What ``quick`` changes in the loop, by family of environments and agent."""
+RULES = (*PAPER, *QUICK)
+NAMES = ("paper", "quick")
 
 
-def preset(env: str, agent: str, name: str) -> tuple[TrainConfig, Any]:
-    """Return the settings of the loop and of the agent.
+def resolve(env: str, agent: str, preset: str = "quick", changes: Values | None = None) -> Resolved:
+    """Return the settings of a preset for an environment and an agent.
 
     Args:
         env: Environment name.
         agent: Agent name.
-        name: ``paper`` or ``quick``.
+        preset: ``paper``, ``quick``, or the path of a preset file.
+        changes: Values that win over the preset's.
 
     Raises:
-        ConfigurationError: The preset or the agent is unknown.
+        ConfigurationError: A name is unknown, or a value is not allowed.
     """
-    if name not in get_args(PresetName):
-        raise ConfigurationError(f"unknown preset {name!r}: choose one of paper, quick")
-    config, family = registry.get(agent).Config, env.partition("-")[0]
-    values = HYPERPARAMETERS[agent]
-    tasks = LEAP_TASKS if agent in ("tdm", "leap") else {"push": PUSH_PAPER}
-    values = values | tasks.get(family, {}) | tasks.get(env, {})
-    if name == "paper":
-        loop = PAPER_LOOPS.get(agent, {}) | (PUSH_LOOP if family == "push" else {})
-        return replace(PAPER, **loop), config(**_known(config, values))
-    train = QUICK.get(env) or QUICK.get(family, QUICK["point"])
-    for key in (("any", agent), (family, agent)):
-        train = replace(train, **QUICK_LOOPS.get(key, {}))
-        values = values | QUICK_HYPERPARAMETERS.get(key, {})
-    return train, config(**_known(config, values), precision=fastest_precision())
+    declaration, config = environments.entry(env), agents.get(agent).Config
+    base, rules = _rules(preset)
+    train, hyperparameters = TrainConfig(), config()
+    sources = {
+        name: Source(allowed.source, allowed.deviates)
+        for settled in (train, hyperparameters)
+        for name, _, allowed in settings.declared(settled)
+    }
+    sources["relabel"] = Source("appendix B")
+    chosen = [rule for rule in rules if rule.applies(base, declaration, agent)]
+    if base == "quick":
+        chosen = [*_of_this_machine(declaration, sources), *chosen]
+    given = Rule("*", changes or {}, "given")
+    values: dict[str, Any] = {}
+    for rule in (*chosen, given):
+        values |= rule.values
+        sources |= dict.fromkeys(rule.values, Source(rule.source, rule.deviates))
+    # All at once: two values may fit each other, and one alone not the default.
+    parts = settings.split(values, (train, hyperparameters))
+    train = settings.changed(train, parts[0])
+    return Resolved(train, settings.changed(hyperparameters, parts[1]), sources)
 
 
-def _known(config: Any, values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values that the configuration has a field for."""
-    names = {field.name for field in fields(config)}
-    return {name: value for name, value in values.items() if name in names}
+def _of_this_machine(env: Declaration, known: Iterable[str]) -> list[Rule]:
+    """Return what `quick` takes from the environment's declaration and from the processor."""
+    rules = [Rule("quick", {"steps": env.steps}, "declaration of the environment")]
+    if "precision" in known:
+        fastest = {"precision": fastest_precision()}
+        rules.append(Rule("quick", fastest, "this machine's fastest"))
+    return rules
+
+
+def _rules(preset: str) -> tuple[str, Sequence[Rule]]:
+    """Return the name of a preset, that of its base for a file, and all rules that may apply."""
+    if preset in NAMES:
+        return preset, RULES
+    if not preset.endswith(".toml"):
+        raise ConfigurationError(
+            f"unknown preset {preset!r}: choose one of {', '.join(NAMES)}, or a .toml file"
+        )
+    return _read(Path(preset))
+
+
+def _read(path: Path) -> tuple[str, Sequence[Rule]]:
+    """Return the base of a preset file, and the base's rules with those of the file after them.
+
+    Raises:
+        ConfigurationError: The file cannot be read or holds something else.
+    """
+    try:
+        content = tomllib.loads(path.read_text())
+        base = content.pop("base", "quick")
+        given = content.pop("rule", [])
+        rules = [Rule("*", **{"source": path.name, **rule}) for rule in given]
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigurationError(f"preset {path}: {error}") from error
+    except (TypeError, AttributeError):
+        raise ConfigurationError(
+            f"preset {path}: a [[rule]] has values, and may have env, agent and source"
+        ) from None
+    if base not in NAMES or content:
+        unknown = ", ".join(content) or f"base {base!r}"
+        raise ConfigurationError(
+            f"preset {path}: {unknown} not understood: it has base (paper or quick) and [[rule]]"
+        )
+    return base, (*RULES, *rules)

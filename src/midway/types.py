@@ -1,10 +1,10 @@
 """Containers and contracts that every floor shares."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
-from jaxtyping import Array, Bool, Float, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Shaped
 
 Metrics: TypeAlias = dict[str, Float[Array, ""]]
 """Scalars on the device, named ``group/name``."""
@@ -74,6 +74,27 @@ class DistanceTask:
 
 
 @dataclass(frozen=True)
+class UnknownTask:
+    """Success of an environment whose rule is not stored with the policy."""
+
+    def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
+        """Raise a ConfigurationError: only the environment itself can tell."""
+        raise ConfigurationError("what counts as reached is known to the environment alone")
+
+    def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
+        """Raise a ConfigurationError, as ``distance``."""
+        return self.distance(achieved, desired), None
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(_as_tuple(part) for part in value) if isinstance(value, list | tuple) else value
+
+
+def _as_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _as_tuple(value) for name, value in values.items()}
+
+
+@dataclass(frozen=True)
 class EnvSpec:
     """What agents and replay may know of an environment.
 
@@ -90,6 +111,10 @@ class EnvSpec:
         task: The definition of success.
         origin: Middle of the states, nothing for zeros; only where goals are observations.
         unit: What networks count in: of a state, they read (state - origin) / unit.
+        center: Typical middle of each entry of an observation; nothing where it is not known.
+        spread: Typical deviation of each entry from it.
+        image_shape: Shape of the images that a frozen encoder made these observations of; ``None``
+            where they are the environment's own.
     """
 
     name: str
@@ -103,11 +128,46 @@ class EnvSpec:
     task: GoalTask
     origin: tuple[float, ...] = ()
     unit: float = 1.0
+    center: tuple[float, ...] = ()
+    spread: tuple[float, ...] = ()
+    image_shape: tuple[int, ...] | None = None
 
     @property
     def is_image(self) -> bool:
         """Whether observations and goals are images."""
         return len(self.observation_shape) == 3
+
+    def encoded(self, num_features: int) -> "EnvSpec":
+        """Return the specification of the features that a frozen encoder makes of the images."""
+        return replace(
+            self,
+            observation_shape=(num_features,),
+            observation_dtype="float32",
+            goal_shape=(num_features,),
+            goal_is_observation=True,
+            image_shape=self.observation_shape,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values; of the task only what `DistanceTask` holds."""
+        values = asdict(self)
+        values["task"] = asdict(self.task) if isinstance(self.task, DistanceTask) else None
+        return values
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any]) -> "EnvSpec":
+        """Return the specification of ``to_json``; a task that is not there judges nothing.
+
+        Raises:
+            ConfigurationError: A value is missing, unknown or has the wrong type.
+        """
+        try:
+            plain = {name: _as_tuple(value) for name, value in values.items()}
+            task = plain["task"]
+            plain["task"] = UnknownTask() if task is None else DistanceTask(**_as_tuples(task))
+            return EnvSpec(**plain)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ConfigurationError(f"environment not understood: {error}") from error
 
 
 class Subgoal(NamedTuple):
@@ -131,7 +191,9 @@ class Batch(NamedTuple):
     """Relabelled transitions; reward and terminated belong to ``goal``.
 
     ``outcome`` is what they were computed from; ``None`` where that is ``next_observation`` and
-    ``goal``.
+    ``goal``. The others are there where `Sampling` asks for them: ``steps`` from the observation to
+    the next one, steps that the episode needed from the observation to the goal (infinite where
+    it is not known to get there), and an observation between the two.
     """
 
     observation: Shaped[Array, "B ..."]
@@ -142,6 +204,27 @@ class Batch(NamedTuple):
     goal: Shaped[Array, "B ..."]
     subgoal_candidate: Subgoal
     outcome: Outcome | None = None
+    steps: Float[Array, " B"] | None = None
+    reached_in: Float[Array, " B"] | None = None
+    between: Shaped[Array, "B ..."] | None = None
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """What an agent wants of a batch besides transitions with relabelled goals.
+
+    Attributes:
+        n_step: Steps from an observation to its next observation, at most; the way ends earlier
+            where the goal is reached or the episode ends.
+        unreached: Whether goals that are reached in the observation itself are drawn again.
+        reached_in: Whether `Batch.reached_in` is wanted.
+        between: Whether `Batch.between` is wanted.
+    """
+
+    n_step: int = 1
+    unreached: bool = False
+    reached_in: bool = False
+    between: bool = False
 
 
 @dataclass(frozen=True)
@@ -152,110 +235,31 @@ class RelabelMix:
         own: Goal that the episode was collected with.
         random: Achieved goal of a random state of the replay.
         future: Achieved goal of a later state of the same episode.
+        future_discount: A state k steps later is drawn in proportion to this to the power k; 1
+            draws uniformly from the rest of the episode, as hindsight relabelling does.
     """
 
     own: float = 0.2
     random: float = 0.4
     future: float = 0.4
+    future_discount: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the shares.
 
         Raises:
-            ConfigurationError: A share is negative or their sum is not 1.
+            ConfigurationError: A share is negative, their sum is not 1, or the discount is not in
+                (0, 1].
         """
         shares = (self.own, self.random, self.future)
         if min(shares) < 0 or abs(sum(shares) - 1) > 1e-6:
             raise ConfigurationError(
                 f"relabel mix {shares}: the shares (own, random, future) must be >= 0 and add to 1"
             )
-
-
-Config = TypeVar("Config", contravariant=True)
-State = TypeVar("State")
-
-
-class Agent(Protocol[Config, State]):
-    """An algorithm as pure functions; it never sees an environment, a logger or a file."""
-
-    def create(self, config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
-        """Return networks and optimisers at their start."""
-        ...
-
-    def update(self, state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
-        """Return the state after one gradient step of every network, and scalars to log."""
-        ...
-
-    def act(
-        self,
-        state: State,
-        observation: Shaped[Array, "B ..."],
-        goal: Shaped[Array, "B ..."],
-        key: Key[Array, ""],
-        explore: bool,
-    ) -> Float[Array, "B action_dim"]:
-        """Return actions in [-1, 1]: sampled where ``explore``, else the tanh of the mean."""
-        ...
-
-
-Memory: TypeAlias = PyTree
-"""What an agent remembers of running episodes: arrays with one row for each."""
-
-
-@runtime_checkable
-class Remembering(Protocol):
-    """What an agent adds if it remembers something from one step of an episode to the next.
-
-    Its ``act`` is then that of an episode's first step.
-    """
-
-    def begin(self, config: Any, spec: EnvSpec, num_episodes: int) -> Memory:
-        """Return what is remembered before the first step of each episode."""
-        ...
-
-    def act_on(
-        self,
-        state: Any,
-        memory: Memory,
-        observation: Shaped[Array, "B ..."],
-        goal: Shaped[Array, "B ..."],
-        key: Key[Array, ""],
-        explore: bool,
-    ) -> tuple[Float[Array, "B action_dim"], Memory]:
-        """Return actions in [-1, 1], and what to remember until the next step."""
-        ...
-
-
-@dataclass(frozen=True)
-class Pretraining:
-    """What an agent learns from states of the environment before the first update.
-
-    Attributes:
-        networks: Parts of the agent's state that this trains; they are saved and can be reused.
-        states: Number of states.
-        random_actions: Actions taken after each reset; the states before and after each are used.
-        rounds: Calls of ``pretrain``.
-        source: Run folder whose networks are taken instead, or nothing.
-    """
-
-    networks: tuple[str, ...]
-    states: int
-    random_actions: int
-    rounds: int
-    source: str = ""
-
-
-@runtime_checkable
-class Pretrained(Protocol):
-    """What an agent adds if it learns from states of the environment before the first update."""
-
-    def pretraining(self, config: Any) -> Pretraining:
-        """Return how much there is to learn."""
-        ...
-
-    def pretrain(self, state: Any, states: Subgoal, key: Key[Array, ""]) -> tuple[Any, Metrics]:
-        """Return the agent's state after one round on these states, and scalars to log."""
-        ...
+        if not 0 < self.future_discount <= 1:
+            raise ConfigurationError(
+                f"relabel mix, future_discount {self.future_discount}: must be above 0, at most 1"
+            )
 
 
 Observation: TypeAlias = Mapping[str, Any]

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from midway.agent import AnyAgent
 from midway.agents import registry
+from midway.settings import names
 from midway.types import Batch, DistanceTask, EnvSpec, Subgoal
 
 TASK = DistanceTask(((0, 1),), 0.5)
@@ -24,7 +25,7 @@ SPECS = {
 class Case(NamedTuple):
     """An agent, compiled once for all tests, its start on a specification, and a batch."""
 
-    agent: ModuleType
+    agent: AnyAgent
     spec: EnvSpec
     state: Any
     batch: Batch
@@ -60,7 +61,7 @@ def draw_batch(spec: EnvSpec, size: int, seed: int = 0) -> Batch:
 def make_case(name: str, kind: str) -> Case:
     agent, spec = registry.get(name), SPECS[kind]
     # Large learning rates, so that one step moves what the next step reads.
-    rates = {field: 0.01 for field in vars(agent.Config) if field.endswith("_learning_rate")}
+    rates = {field: 0.01 for field in names(agent.Config) if field.endswith("_learning_rate")}
     state = agent.create(agent.Config(hidden=(16, 16), **rates), spec, jax.random.key(0))
     return Case(agent, spec, state, draw_batch(spec, 32), eqx.filter_jit(agent.update))
 

@@ -1,7 +1,7 @@
 """What every agent promises: pure updates, one compilation, targets that move by τ, actions."""
 
 import functools
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 
 import equinox as eqx
 import jax
@@ -9,10 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from midway.agents import registry, ris, sac
+from midway import functional
+from midway.agent import Agent
+from midway.agents import leap, registry, ris, sac, tdm
 from midway.types import ConfigurationError, Subgoal
 
 KEY = jax.random.key(7)
+ABILITIES = ("value", "subgoals", "memory", "pretrain", "freezing")
 
 
 def arrays(tree) -> list[np.ndarray]:
@@ -31,10 +34,63 @@ def changed(before, after) -> set[str]:
 
 
 def test_registry_knows_the_agents():
-    assert registry.get("ris") is ris
-    assert registry.get("sac") is sac
-    for module in registry.AGENTS.values():
-        assert {"Config", "State", "NETWORKS", "create", "update", "act"} <= set(dir(module))
+    modules = {"ris": ris, "sac": sac, "tdm": tdm, "leap": leap}
+    for name, module in modules.items():
+        agent = registry.get(name)
+        assert agent is module.AGENT
+        assert isinstance(agent, Agent)
+        assert (agent.Config, agent.create, agent.act) == (module.Config, module.create, module.act)
+        assert registry.name_of(agent) == registry.name_of(name) == name
+        with pytest.raises(FrozenInstanceError):
+            agent.networks = ()
+    assert set(modules) <= set(registry.AGENTS)
+
+
+def test_abilities_are_fields_that_can_be_asked_for():
+    asked = {
+        name: {a for a in ABILITIES if getattr(registry.AGENTS[name], a) is not None}
+        for name in ("ris", "sac", "tdm", "leap")
+    }
+    assert asked == {
+        "ris": {"value", "subgoals", "freezing"},
+        "sac": {"value", "freezing"},
+        "tdm": {"value", "memory", "freezing"},
+        "leap": {"value", "memory", "pretrain", "freezing"},
+    }
+    assert leap.AGENT.memory.plan is not None
+    assert tdm.AGENT.memory.plan is None
+
+
+def test_an_agent_of_others_is_found_by_its_module_and_attribute():
+    agent = registry.get("another_agent:AGENT")
+    assert agent.Config is sac.Config
+    assert registry.name_of(agent) == "another_agent:AGENT"
+    # One of ours has a name of ours, however it is asked for.
+    assert registry.get("midway.agents.ris:AGENT") is ris.AGENT
+    assert registry.name_of(registry.get("midway.agents.ris:AGENT")) == "ris"
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("no_such_module_here:AGENT", "No module named 'no_such_module_here'"),
+        ("midway.agents.ris:NOTHING", "NOTHING"),
+        ("midway.agents.ris:Config", "is a type, not a midway Agent"),
+        ("midway.agents.ris:", "agent midway.agents.ris:"),
+        (":AGENT", "agent :AGENT"),
+        ("", "unknown agent ''"),
+    ],
+)
+def test_an_agent_that_cannot_be_had_is_refused_in_one_line(name, said):
+    with pytest.raises(ConfigurationError) as error:
+        registry.get(name)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_an_agent_that_no_folder_can_name_is_refused():
+    with pytest.raises(ConfigurationError, match="no top-level name of midway"):
+        registry.name_of(replace(sac.AGENT, value=None))
 
 
 def test_registry_refuses_unknown_names_and_says_what_is_allowed():
@@ -52,8 +108,7 @@ def test_defaults_are_table_1_for_ant_navigation():
         "policy_learning_rate": 1e-3,
         "subgoal_learning_rate": 1e-4,
         "encoder_learning_rate": 1e-4,
-        "encoder_updates": 0,
-        "image_translation": 8,
+        "random_shift": 8,
         "image_pooling": 1,
         "kl_weight": 0.1,
         "advantage_temperature": 0.1,
@@ -61,15 +116,15 @@ def test_defaults_are_table_1_for_ant_navigation():
         "epsilon": 1e-16,
         "precision": "f32",
     }
-    assert ris.Config().value_bound == pytest.approx(100)
+    assert functional.value_bound(ris.Config().discount) == pytest.approx(100)
     shared = vars(sac.Config()).items() & vars(ris.Config()).items()
     assert len(shared) == len(vars(sac.Config())) - 1  # all but the entropy's learning rate
 
 
-def test_copies_start_equal_to_their_originals_with_arrays_of_their_own(case):
+def test_target_networks_start_equal_to_the_online_ones_with_arrays_of_their_own(case):
     state = case.state
     copies = [(state.critic, state.target_critic)]
-    if case.agent is ris:
+    if case.agent is ris.AGENT:
         copies.append((state.policy, state.prior_policy))
     for online, copy in copies:
         assert equal(online, copy)
@@ -81,8 +136,8 @@ def test_copies_start_equal_to_their_originals_with_arrays_of_their_own(case):
 
 
 def test_networks_are_parts_of_the_state(case):
-    assert set(case.agent.NETWORKS) <= set(vars(case.state))
-    assert "policy" in case.agent.NETWORKS
+    assert set(case.agent.networks) <= set(vars(case.state))
+    assert "policy" in case.agent.networks
 
 
 def test_update_changes_every_part_and_reports_finite_scalars(case):
@@ -90,7 +145,7 @@ def test_update_changes_every_part_and_reports_finite_scalars(case):
     stateless = {"encoder", "encoder_optimizer"}  # the encoder of states has no weights
     assert changed(case.state, state) >= set(vars(state)) - {"config", "spec"} - stateless
     assert all(np.isfinite(x).all() for x in arrays(state))
-    groups = {"critic", "policy"} | ({"subgoal"} if case.agent is ris else set())
+    groups = {"critic", "policy"} | ({"subgoal"} if case.agent is ris.AGENT else set())
     assert {name.split("/")[0] for name in metrics} == groups
     for name, value in metrics.items():
         assert value.shape == (), name
@@ -119,7 +174,7 @@ def test_targets_move_by_exactly_the_target_update_rate(case):
     again, _ = case.update(state, case.batch, jax.random.key(8))
     rate = case.state.config.target_update_rate
     pairs = [("critic", "target_critic")]
-    if case.agent is ris:
+    if case.agent is ris.AGENT:
         pairs.append(("policy", "prior_policy"))
     for online, copy in pairs:
         for new, old_copy, new_copy in zip(
@@ -209,10 +264,10 @@ def test_actions_stay_in_their_bounds_whatever_the_policy_says(case, explore):
 
 
 def test_actions_come_from_the_policy_alone(case):
-    """At test time the flat policy acts: no critic, no copy and no subgoal policy has a say."""
+    """The flat policy acts: no critic, target network or subgoal policy has a say."""
     broken = {
         name: jax.tree.map(lambda x: jnp.nan * x, getattr(case.state, name))
-        for name in case.agent.NETWORKS
+        for name in case.agent.networks
         if name not in {"encoder", "policy"}
     }
     actions = acting(case)(

@@ -117,7 +117,7 @@ def test_constants_are_those_of_table_1(state: ris.State):
     defaults = ris.Config()
     for name in ("discount", "kl_weight", "advantage_temperature", "epsilon", "num_subgoals"):
         assert getattr(state.config, name) == pytest.approx(getattr(defaults, name))
-    assert state.config.value_bound == pytest.approx(100)
+    assert functional.value_bound(state.config.discount) == pytest.approx(100)
 
 
 @eqx.filter_jit
@@ -140,7 +140,7 @@ def test_critic_target(state: ris.State, batch: Batch, golden: dict[str, np.ndar
 def test_critic_loss_and_gradient(state: ris.State, batch: Batch, golden: dict[str, np.ndarray]):
     target = jnp.asarray(golden["critic/target"])
     networks = (state.critic, state.encoder)
-    (loss, (code, metrics)), (gradient, _) = gradient_of(
+    (loss, (features, metrics)), (gradient, _) = gradient_of(
         ris.critic_loss, networks, batch.observation, batch, target
     )
     assert_close(state.critic(batch.observation, batch.action, batch.goal), golden["critic/q"].T)
@@ -148,7 +148,7 @@ def test_critic_loss_and_gradient(state: ris.State, batch: Batch, golden: dict[s
     assert_close(metrics["critic/loss"], golden["critic/loss"])
     assert_close(metrics["critic/q"], golden["critic/q"].mean())
     assert_close(metrics["critic/target"], golden["critic/target"].mean())
-    np.testing.assert_array_equal(code, batch.observation)
+    np.testing.assert_array_equal(features, batch.observation)
     assert_gradient(gradient.first, golden, "critic/gradient", CRITICS[0])
     assert_gradient(gradient.second, golden, "critic/gradient", CRITICS[1])
 
@@ -158,7 +158,7 @@ def test_subgoal_intermediates(state: ris.State, batch: Batch, golden: dict[str,
         return functional.subgoal_cost(
             ris.value(state, batch.observation, subgoal),
             ris.value(state, subgoal, batch.goal),
-            state.config.value_bound,
+            functional.value_bound(state.config.discount),
         )
 
     @eqx.filter_jit

@@ -1,6 +1,6 @@
 """Agents on images: one encoder for all networks, trained by the critics' loss alone."""
 
-import itertools
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from midway.agents import registry
+from midway.agents import registry, ris, sac
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
+from midway.training import freeze
 from midway.types import Batch, DistanceTask, EnvSpec, Outcome, Subgoal
 
 IMAGE = (31, 31, 3)
@@ -67,8 +68,9 @@ def test_the_encoder_is_trained_by_the_critics_loss_of_the_current_image_alone(n
     after, _ = eqx.filter_jit(agent.update)(state, drawn(), KEY)
     count = {"ris": 4, "sac": 3}[name]
     encoding_key, target_key = jax.random.split(KEY, count)[:2]
-    observation, batch = encoders.encode_fixed(state.encoder, drawn(), True, encoding_key)
-    target = agent.critic_target(state, batch, jax.random.normal(target_key, (BATCH, 2)))
+    observation, batch = encoders.encode_batch(state.encoder, drawn(), encoding_key)
+    module = {"ris": ris, "sac": sac}[name]
+    target = module.critic_target(state, batch, jax.random.normal(target_key, (BATCH, 2)))
 
     def loss(encoder):
         q = state.critic(encoder(observation), batch.action, batch.goal)
@@ -82,20 +84,21 @@ def test_the_encoder_is_trained_by_the_critics_loss_of_the_current_image_alone(n
         np.testing.assert_allclose(found, wanted, atol=2e-6)
 
 
-def test_candidates_are_the_codes_of_other_observations():
-    ris, state = made("ris")
-    code = state.encoder(drawn().observation)
-    candidate = ris.subgoal_candidates(state.encoder, drawn(), code)
-    np.testing.assert_array_equal(candidate.observation[1:], code[:-1])
-    np.testing.assert_array_equal(candidate.observation[0], code[-1])
+def test_candidates_are_the_features_of_other_observations():
+    _, state = made("ris")
+    features = state.encoder(drawn().observation)
+    candidate = ris.subgoal_candidates(state.encoder, drawn(), features)
+    np.testing.assert_array_equal(candidate.observation[1:], features[:-1])
+    np.testing.assert_array_equal(candidate.observation[0], features[-1])
     np.testing.assert_array_equal(candidate.achieved_goal, candidate.observation)
 
 
-def test_subgoals_are_imagined_as_codes():
-    ris, state = made("ris")
-    code = state.encoder(drawn().observation)
-    imagined = ris.imagine(state, code, code, KEY)
-    assert imagined.observation.shape == (BATCH, 10, encoders.CODE_SIZE)
+def test_subgoals_are_imagined_as_features():
+    _, state = made("ris")
+    features = state.encoder(drawn().observation)
+    batch = drawn()._replace(observation=features, goal=features)
+    imagined = ris.imagine(state, batch, KEY)
+    assert imagined.observation.shape == (BATCH, 10, encoders.NUM_FEATURES)
 
 
 @pytest.mark.parametrize("name", ["ris", "sac", "tdm"])
@@ -109,26 +112,41 @@ def test_acting_sees_images_as_they_are(name):
 
 
 @pytest.mark.parametrize("name", ["ris", "sac", "tdm"])
-def test_an_encoder_whose_updates_are_over_stays_and_the_rest_learns_on(name):
-    agent = registry.get(name)
-    state = agent.create(agent.Config(hidden=(16, 16), encoder_updates=2), SPEC, KEY)
-    update, encoders_seen, critics_seen = eqx.filter_jit(agent.update), [], []
-    for i in range(4):
-        state, _ = update(state, drawn(), jax.random.key(i))
-        encoders_seen.append(leaves((state.encoder, state.encoder_optimizer)))
-        critics_seen.append(leaves(state.critic))
+def test_on_features_of_a_frozen_encoder_an_agent_is_one_of_states(name):
+    agent, pictured = made(name)
+    encoder = agent.freezing.encoder(pictured)
+    spec = freeze.encoded_spec(SPEC, encoder)
+    assert (spec.observation_shape, spec.goal_shape) == (2 * ((encoders.NUM_FEATURES,),))
+    assert (spec.image_shape, spec.is_image, spec.state_shape) == (IMAGE, False, (4,))
+    state = agent.create(agent.Config(hidden=(16, 16)), spec, KEY)
+    assert isinstance(state.encoder, encoders.StateEncoder)
+    images = drawn()
+    batch = images._replace(
+        observation=encoder(images.observation),
+        next_observation=encoder(images.next_observation),
+        goal=encoder(images.goal),
+        subgoal_candidate=Subgoal(*map(encoder, images.subgoal_candidate)),
+    )
+    after, metrics = eqx.filter_jit(agent.update)(state, batch, KEY)
+    assert all(np.isfinite(value) for value in metrics.values())
+    for part in ("critic", "policy"):
+        pairs = zip(leaves(getattr(state, part)), leaves(getattr(after, part)), strict=True)
+        assert any((old != new).any() for old, new in pairs)
+    # The networks have the sizes of those of images: only what comes before them is gone.
+    for part in set(agent.networks) - {"encoder"}:
+        sizes = [[x.shape for x in leaves(getattr(s, part))] for s in (pictured, state)]
+        assert sizes[0] == sizes[1]
 
-    def moved(first, second):
-        return any((np.asarray(a) != b).any() for a, b in zip(first, second, strict=True))
 
-    assert [moved(*pair) for pair in itertools.pairwise(encoders_seen)] == [True, False, False]
-    assert all(moved(*pair) for pair in itertools.pairwise(critics_seen))
-
-
-def test_images_are_not_translated_once_the_encoder_stays():
-    _, state = made("ris")
-    batch = drawn()
-    observation, _ = encoders.encode_fixed(state.encoder, batch, jnp.array(False), KEY)
-    np.testing.assert_array_equal(observation, batch.observation)
-    observation, _ = encoders.encode_fixed(state.encoder, batch, jnp.array(True), KEY)
-    assert (observation != batch.observation).any()
+@pytest.mark.parametrize("name", ["ris", "sac", "tdm"])
+def test_the_value_reads_images_as_the_environment_shows_them(name):
+    agent, state = made(name)
+    images, goals = drawn().observation, drawn().goal
+    found = agent.value.estimate(state, images, goals)
+    features = state.encoder(images), state.encoder(goals)
+    spec = freeze.encoded_spec(SPEC, state.encoder)
+    reader = encoders.create(spec, agent.Config(), KEY)
+    on_features = replace(state, encoder=reader)
+    assert found.shape == (BATCH,)
+    wanted = agent.value.estimate(on_features, *features)
+    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-5)

@@ -11,7 +11,8 @@ import pytest
 
 from midway.agents import leap, tdm
 from midway.networks.vae import ImageVAE, StateVAE
-from midway.types import Batch, DistanceTask, EnvSpec, Outcome, Pretrained, Remembering, Subgoal
+from midway.training import freeze
+from midway.types import Batch, DistanceTask, EnvSpec, Outcome, Subgoal
 
 KEY = jax.random.key(3)
 TASK = DistanceTask(((0, 1),), 0.5)
@@ -50,6 +51,22 @@ def with_plain_latents(state: leap.State) -> leap.State:
 
 def planner(config: leap.Config) -> leap.State:
     return with_plain_latents(leap.create(config, SPECS["states"], KEY))
+
+
+def on_features(config):
+    """Return LEAP as it acts on images: made for the latents of its frozen autoencoder."""
+    pictured = leap.create(config, SPECS["images"], KEY)
+    encoder = leap.AGENT.freezing.encoder(pictured)
+    spec = freeze.encoded_spec(SPECS["images"], encoder)
+    fresh = leap.create(config, spec, KEY)
+    return freeze.keep(leap.AGENT, fresh, pictured), spec, encoder
+
+
+def made(config, kind):
+    """Return LEAP as it acts and learns on a kind of observations, and what it was made for."""
+    if kind == "images":
+        return on_features(config)[:2]
+    return leap.create(config, SPECS[kind], KEY), SPECS[kind]
 
 
 # --- the planner ----------------------------------------------------------------------------------
@@ -206,9 +223,8 @@ def test_exploration_is_the_tdm_without_a_plan():
 
 @pytest.mark.parametrize("kind", SPECS)
 def test_actions_are_in_bounds_and_repeatable(kind):
-    spec = SPECS[kind]
     config = replace(SMALL, plan_samples=8, plan_iterations=2)
-    state = leap.create(config, spec, KEY)
+    state, spec = made(config, kind)
     observation = jnp.ones((2, *spec.observation_shape), spec.observation_dtype)
     goal = jnp.zeros((2, *spec.goal_shape), spec.observation_dtype)
     act = eqx.filter_jit(leap.act)
@@ -225,18 +241,18 @@ def test_actions_are_in_bounds_and_repeatable(kind):
 def test_subgoals_have_both_roles():
     state = leap.create(SMALL, SPECS["pairs"], KEY)
     latent = jax.random.normal(KEY, (4, 2))
-    subgoal = leap.subgoal_codes(state, latent)
+    subgoal = leap.subgoals_of(state, latent)
     both = state.vae.decode(latent)
     np.testing.assert_array_equal(subgoal.observation, both[:, :5])
     np.testing.assert_array_equal(subgoal.achieved_goal, both[:, 5:])
 
 
 def test_image_subgoals_are_decoded_and_encoded_again():
-    state = leap.create(replace(SMALL, latent_size=6), SPECS["images"], KEY)
+    state, _ = made(replace(SMALL, latent_size=6), "images")
     assert isinstance(state.vae, ImageVAE)
     assert state.policy.layers[0].weight.shape[0] == 6 + 6 + 1
     latent = jax.random.normal(KEY, (3, 6))
-    subgoal = leap.subgoal_codes(state, latent)
+    subgoal = leap.subgoals_of(state, latent)
     expected = state.vae.encode(state.vae.decode(latent)).mean
     np.testing.assert_allclose(subgoal.observation, expected, rtol=1e-5)
     assert subgoal.observation is subgoal.achieved_goal
@@ -249,7 +265,7 @@ def draw_batch(spec: EnvSpec, size: int) -> Batch:
     rng = np.random.default_rng(0)
 
     def draw(shape):
-        if spec.is_image:
+        if spec.observation_dtype == "uint8":
             return jnp.asarray(rng.integers(0, 256, (size, *shape)), jnp.uint8)
         return jnp.asarray(rng.normal(size=(size, *shape)), jnp.float32)
 
@@ -265,16 +281,16 @@ def draw_batch(spec: EnvSpec, size: int) -> Batch:
         next_observation=following,
         goal=goal,
         subgoal_candidate=Subgoal(observation, goal),
-        outcome=None if spec.goal_is_observation and not spec.is_image else Outcome(*truth),
+        outcome=None if spec.goal_is_observation and not spec.state_shape else Outcome(*truth),
     )
 
 
 @pytest.mark.parametrize("kind", SPECS)
 def test_updates_are_those_of_the_tdm_and_leave_the_autoencoder(kind):
-    spec = SPECS[kind]
-    state, batch = leap.create(SMALL, spec, KEY), draw_batch(spec, 8)
+    state, spec = made(SMALL, kind)
+    batch = draw_batch(spec, 8)
     copies = arrays((state, batch))
-    after, metrics = eqx.filter_jit(leap.update)(state, batch, KEY)
+    after, metrics = eqx.filter_jit(leap.AGENT.update)(state, batch, KEY)
     assert all(np.array_equal(a, b) for a, b in zip(copies, arrays((state, batch)), strict=True))
     assert isinstance(after, leap.State)
     assert equal(after.vae, state.vae)
@@ -314,17 +330,57 @@ def test_pretraining_reads_both_roles_of_a_state():
     assert after.vae.center.shape == (7,)
 
 
-def test_settings_of_the_stage_before():
-    settings = leap.pretraining(leap.Config(vae_source="runs/other"))
+def test_settings_of_pretraining():
+    settings = leap.pretrain_settings(leap.Config(vae_source="runs/other"))
     assert settings.networks == ("vae",)
     assert (settings.states, settings.rounds, settings.source) == (50_000, 2_500, "runs/other")
 
 
-def test_leap_and_tdm_keep_the_optional_contracts():
-    assert isinstance(leap, Remembering)
-    assert isinstance(leap, Pretrained)
-    assert isinstance(tdm, Remembering)
-    assert not isinstance(tdm, Pretrained)
+def test_the_value_of_leap_is_that_of_its_tdm_at_the_whole_horizon():
+    state = leap.create(SMALL, SPECS["pairs"], KEY)
+    observation, goal = jax.random.normal(KEY, (6, 5)), jax.random.normal(KEY, (6, 2))
+    found = leap.AGENT.value.estimate(state, observation, goal)
+    whole = jnp.full((6, 1), float(SMALL.max_steps_left))
+    np.testing.assert_allclose(found, tdm.value(state, observation, goal, whole), rtol=1e-6)
+
+
+def test_reconstructions_are_what_the_autoencoder_keeps_of_both_roles():
+    state = leap.create(SMALL, SPECS["pairs"], KEY)
+    states = Subgoal(jax.random.normal(KEY, (9, 5)), jax.random.normal(KEY, (9, 2)))
+    both = jnp.concatenate(states, axis=1)
+    expected = state.vae.decode(state.vae.encode(both).mean)
+    np.testing.assert_array_equal(leap.AGENT.pretrain.reconstruct(state, states), expected)
+
+
+def test_plans_are_told_as_achieved_goals_in_the_units_of_the_environment():
+    spec = replace(SPECS["pairs"], origin=(1.0, 2.0, 0.0, 0.0, 0.0, 3.0, 4.0), unit=0.5)
+    spec = replace(spec, observation_shape=(7,), goal_shape=(7,), goal_is_observation=True)
+    state = leap.create(SMALL, spec, KEY)
+    memory = leap.begin(SMALL, spec, 2)._replace(latents=jax.random.normal(KEY, (2, 3, 2)))
+    plans = leap.AGENT.memory.plan(state, memory)
+    assert plans.shape == (2, 3, 7)
+    np.testing.assert_allclose(plans, state.vae.decode(memory.latents), rtol=1e-5, atol=1e-5)
+
+
+def test_episodes_that_rest_make_no_plan():
+    memory = leap.begin(SMALL, SPECS["states"], 3)
+    rested = leap.AGENT.memory.rest(memory, jnp.array([True, False, True]))
+    state = planner(SMALL)
+    start = jnp.ones((3, 2))
+    latents = leap.plan_where_due(state, start, start, rested, KEY)
+    np.testing.assert_array_equal(latents[::2], 0)
+    assert jnp.abs(latents[1]).max() > 0
+
+
+def test_leap_freezes_its_autoencoder_before_the_first_update():
+    config = replace(SMALL, latent_size=6)
+    state, spec, encoder = on_features(config)
+    assert leap.AGENT.freezing.at_start
+    assert not tdm.AGENT.freezing.at_start
+    assert isinstance(state.vae, ImageVAE)
+    assert (spec.observation_shape, spec.goal_shape, spec.image_shape) == ((6,), (6,), IMAGE)
+    images = draw_batch(SPECS["images"], 3).observation
+    np.testing.assert_array_equal(encoder(images), state.vae.encode(images).mean)
 
 
 def test_defaults_are_those_of_the_ant():

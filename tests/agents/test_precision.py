@@ -27,7 +27,7 @@ def gradients(state: ris.State, batch, noise) -> dict[str, jax.Array]:
         return jnp.concatenate([x.ravel() for x in jax.tree.leaves(gradient)])
 
     target = ris.critic_target(state, batch, noise)
-    imagined = ris.imagine(state, batch.observation, batch.goal, KEY).achieved_goal
+    imagined = ris.imagine(state, batch, KEY).achieved_goal
     networks = (state.critic, state.encoder)
     return {
         "critic": gradient_of(ris.critic_loss, networks, batch.observation, batch, target),

@@ -11,6 +11,7 @@ import pytest
 
 from midway import functional
 from midway.agents import ris
+from midway.networks import encoder as encoders
 from midway.networks.policies import Gaussian
 from midway.types import Subgoal
 
@@ -108,7 +109,7 @@ def test_critic_target_by_hand(pairs):
 def test_subgoal_loss_has_gradient_into_the_subgoal_policy_alone(pairs):
     """Not into the critic or the policy, by which the advantage is measured."""
     state, batch = pairs.state, pairs.batch
-    networks = {name: getattr(state, name) for name in ris.NETWORKS}
+    networks = {name: getattr(state, name) for name in ris.AGENT.networks}
 
     @jax.jit
     @jax.grad
@@ -127,7 +128,7 @@ def test_subgoal_gradient_holds_the_weights_fixed(pairs):
         state, batch, state.subgoal_policy(batch.observation, batch.goal).location
     )
     weight = functional.advantage_weights(advantage, state.config.advantage_temperature)
-    candidate = ris.as_vector(state.spec, batch.subgoal_candidate)
+    candidate = encoders.as_vector(state.spec, batch.subgoal_candidate)
 
     @jax.jit
     def both(subgoal_policy):
@@ -151,9 +152,7 @@ def test_imagined_subgoals_carry_no_gradient(pairs):
     @jax.jit
     @jax.grad
     def gradient_of(subgoal_policy):
-        imagined = ris.imagine(
-            replace(state, subgoal_policy=subgoal_policy), batch.observation, batch.goal, KEY
-        )
+        imagined = ris.imagine(replace(state, subgoal_policy=subgoal_policy), batch, KEY)
         return imagined.observation.sum() + imagined.achieved_goal.sum()
 
     gradient = gradient_of(state.subgoal_policy)
@@ -162,11 +161,11 @@ def test_imagined_subgoals_carry_no_gradient(pairs):
 
 def test_imagined_subgoals_are_drawn_from_the_subgoal_policy(ris_case):
     state, batch, spec = ris_case.state, ris_case.batch, ris_case.spec
-    imagined = ris.imagine(state, batch.observation, batch.goal, KEY)
+    imagined = ris.imagine(state, batch, KEY)
     assert imagined.observation.shape == (32, 10, *spec.observation_shape)
     assert imagined.achieved_goal.shape == (32, 10, *spec.goal_shape)
     subgoals = state.subgoal_policy(batch.observation, batch.goal)
-    drawn = ris.as_vector(spec, imagined)
+    drawn = encoders.as_vector(spec, imagined)
     noise = (drawn - subgoals.location[:, None]) / jnp.exp(subgoals.log_scale)[:, None]
     # A standard Laplace has mean absolute value 1 and variance 2.
     assert abs(noise).mean() == pytest.approx(1, abs=0.1)
@@ -176,7 +175,7 @@ def test_imagined_subgoals_are_drawn_from_the_subgoal_policy(ris_case):
 
 def test_roles_of_a_subgoal_are_split_and_joined(ris_case):
     candidate = ris_case.batch.subgoal_candidate
-    vector = ris.as_vector(ris_case.spec, candidate)
+    vector = encoders.as_vector(ris_case.spec, candidate)
     sizes = ris_case.spec.observation_shape[0], ris_case.spec.goal_shape[0]
     assert vector.shape[1] == (sizes[0] if ris_case.spec.goal_is_observation else sum(sizes))
     for ours, expected in zip(ris.as_subgoal(ris_case.spec, vector), candidate, strict=True):
@@ -224,7 +223,7 @@ def test_equal_advantages_give_every_candidate_the_same_weight(pairs):
     constant = jax.tree.map(jnp.zeros_like, state.critic)
     loss, metrics = ris.subgoal_loss(state.subgoal_policy, replace(state, critic=constant), batch)
     subgoals = state.subgoal_policy(batch.observation, batch.goal)
-    candidate = ris.as_vector(state.spec, batch.subgoal_candidate)
+    candidate = encoders.as_vector(state.spec, batch.subgoal_candidate)
     assert metrics["subgoal/effective_candidates"] == pytest.approx(32, rel=1e-5)
     assert metrics["subgoal/advantage"] == 0
     assert loss == pytest.approx(-float(subgoals.log_density(candidate).mean()), rel=1e-4)

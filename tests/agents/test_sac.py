@@ -104,7 +104,7 @@ def test_entropy_coefficient_moves_towards_the_target_entropy(sac_case, bias, di
 
 
 def test_steps_follow_each_other_and_change_their_own_networks_only(sac_case, monkeypatch):
-    """Critics, policy and its coefficient, copies: each reads what the one before has updated."""
+    """Critics, policy, coefficient, target networks: each reads what was updated before it."""
     record = []
 
     def recorded(name):
@@ -117,17 +117,17 @@ def test_steps_follow_each_other_and_change_their_own_networks_only(sac_case, mo
 
         return wrapper
 
-    def copies(online, target, rate):
-        record.append(("copies", online, target))
-        return polyak_update(online, target, rate)
+    def targets(online, target, rate):
+        record.append(("targets", online, target))
+        return target_update(online, target, rate)
 
     for name in ("update_critic", "update_policy"):
         monkeypatch.setattr(sac, name, recorded(name))
-    polyak_update = functional.polyak_update
-    monkeypatch.setattr(functional, "polyak_update", copies)
+    target_update = functional.target_update
+    monkeypatch.setattr(functional, "target_update", targets)
     eqx.filter_eval_shape(lambda: sac.update(sac_case.state, sac_case.batch, KEY)[0])
 
-    assert [name for name, *_ in record] == ["update_critic", "update_policy", "copies"]
+    assert [name for name, *_ in record] == ["update_critic", "update_policy", "targets"]
     (_, start, after_critic), (_, before_policy, after_policy), (_, online, target) = record
     assert start is sac_case.state
     assert before_policy is after_critic

@@ -160,7 +160,7 @@ def test_updates_are_pure(spec):
     assert not equal(first, other)  # other steps_left, other noise
 
 
-def test_policy_and_copies_move_on_every_second_update(spec):
+def test_policy_and_target_networks_move_on_every_second_update(spec):
     state, batch = tdm.create(SMALL, spec, KEY), draw_batch(spec)
     always = {"critic", "critic_optimizer", "updates"}
     delayed = {"policy", "policy_optimizer", "target_policy", "target_critic"}
@@ -173,7 +173,7 @@ def test_policy_and_copies_move_on_every_second_update(spec):
         state = after
 
 
-def test_copies_move_by_their_rate():
+def test_target_networks_move_by_their_rate():
     spec = SPECS["states"]
     config = replace(SMALL, target_update_rate=0.25)
     state, batch = tdm.create(config, spec, KEY), draw_batch(spec)
@@ -186,7 +186,7 @@ def test_copies_move_by_their_rate():
             np.testing.assert_allclose(m, 0.25 * n + 0.75 * o, rtol=1e-5, atol=1e-7)
 
 
-def test_copies_have_arrays_of_their_own_and_outputs_start_small():
+def test_target_networks_have_arrays_of_their_own_and_outputs_start_small():
     state = tdm.create(SMALL, SPECS["states"], KEY)
     pairs = ((state.critic, state.target_critic), (state.policy, state.target_policy))
     for online, copy in pairs:

@@ -3,11 +3,11 @@
 from pathlib import Path
 
 import pytest
+from midway.training.folder import RunFolder
 
 from midway.cli.main import main
 from midway.cluster import sweep
 from midway.cluster.jobs import Job
-from midway.training.folder import RunFolder
 from midway.types import ConfigurationError
 
 TINY = ["hidden=(8,)", "batch_size=8", "num_envs=4", "random_steps=16", "replay_capacity=2000"]

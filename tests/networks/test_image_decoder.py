@@ -1,57 +1,57 @@
-"""The decoder of codes, and how it is fitted."""
+"""The decoder of features, and how it is fitted."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from midway.training.decoder import fit_to
 
 from midway.networks.decoder import ImageDecoder, loss
-from midway.training.decoder import fit_to
 
 KEY = jax.random.key(0)
 
 
 def squares(count: int) -> tuple[jax.Array, jax.Array]:
-    """Return images of a bright square, and codes that hold its corner, far from standardised."""
+    """Return images of a bright square, and features of its corner, far from standardised."""
     corners = np.random.default_rng(0).integers(0, 64, (count, 2))
     images = np.full((count, 84, 84, 3), 40, np.uint8)
     for image, (row, column) in zip(images, corners, strict=True):
         image[row : row + 20, column : column + 20, 0] = 240
-    codes = np.concatenate([1000 + corners, np.full((count, 1), 7.0)], 1).astype(np.float32)
-    return jnp.asarray(codes), jnp.asarray(images)
+    features = np.concatenate([1000 + corners, np.full((count, 1), 7.0)], 1).astype(np.float32)
+    return jnp.asarray(features), jnp.asarray(images)
 
 
 def test_a_new_decoder_gives_images_around_the_mean_image() -> None:
-    codes, images = squares(40)
-    decoder = ImageDecoder(3, key=KEY).standardised(codes, images)
-    decoded = decoder(codes)
+    features, images = squares(40)
+    decoder = ImageDecoder(3, key=KEY).standardised(features, images)
+    decoded = decoder(features)
     assert decoded.shape == (40, 84, 84, 3)
     mean = np.asarray(images, np.float64).mean(0) / 255
     assert np.abs(np.asarray(decoded) - mean).mean() < 0.1
-    standard = (codes - decoder.center) / decoder.scale
+    standard = (features - decoder.center) / decoder.scale
     np.testing.assert_allclose(standard.std(0), [1, 1, 0], atol=1e-3)
 
 
 def test_what_the_images_say_of_themselves_is_not_trained() -> None:
-    codes, images = squares(4)
-    decoder = ImageDecoder(3, key=KEY).standardised(codes, images)
-    gradient = eqx.filter_grad(loss)(decoder, codes, images)
+    features, images = squares(4)
+    decoder = ImageDecoder(3, key=KEY).standardised(features, images)
+    gradient = eqx.filter_grad(loss)(decoder, features, images)
     for fixed in (gradient.center, gradient.scale, gradient.background):
         assert not fixed.any()
     assert gradient.hidden.layers[0].weight.any()
 
 
 def test_the_loss_is_the_squared_error_of_an_image() -> None:
-    codes, images = squares(2)
+    features, images = squares(2)
     decoder = ImageDecoder(3, key=KEY)
-    expected = ((np.asarray(images) / 255 - np.asarray(decoder(codes))) ** 2).sum() / 2
-    assert float(loss(decoder, codes, images)) == pytest.approx(expected, rel=1e-4)
+    expected = ((np.asarray(images) / 255 - np.asarray(decoder(features))) ** 2).sum() / 2
+    assert float(loss(decoder, features, images)) == pytest.approx(expected, rel=1e-4)
 
 
-def test_fitting_finds_the_images_of_new_codes() -> None:
-    """Without the codes, the mean image leaves an error that most of must go."""
-    codes, images = squares(600)
-    decoder = fit_to(codes[:500], images[:500], KEY, updates=400)
+def test_fitting_finds_the_images_of_new_features() -> None:
+    """Without the features, the mean image leaves an error that most of must go."""
+    features, images = squares(600)
+    decoder = fit_to(features[:500], images[:500], KEY, updates=400)
     blank = ((images[500:] / 255 - decoder.background) ** 2).sum((1, 2, 3)).mean()
-    assert float(loss(decoder, codes[500:], images[500:])) < 0.4 * float(blank)
+    assert float(loss(decoder, features[500:], images[500:])) < 0.4 * float(blank)

@@ -79,7 +79,7 @@ def test_states_on_a_plane_are_reconstructed_from_two_numbers():
     distance = jnp.linalg.norm((reconstruction - states)[:, :2], axis=1)
     assert distance.mean() < 0.25
     latents = model.encode(states)
-    assert 0.5 < latents.mean.std() < 2  # the prior holds the codes together
+    assert 0.5 < latents.mean.std() < 2  # the prior holds the latents together
 
 
 def test_loss_is_error_plus_weighted_divergence():

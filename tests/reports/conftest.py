@@ -2,13 +2,16 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
+from untrained import save_untrained
 
-from midway.training import api, decoder, policy
-from midway.training.folder import RunFolder
+from midway import api
+from midway.reports import decoder
+from midway.runs.folder import RunFolder
 
 TINY = {
     "num_envs": 8,
@@ -62,13 +65,11 @@ def copy_run(tmp_path: Path) -> Callable[..., Path]:
     return copy
 
 
-def untrained(path: Path, env: str, agent: str) -> Path:
+def untrained(path: Path, env: str, agent: str, changes: Mapping[str, Any] | None = None) -> Path:
     """Return a run folder of an agent that has learned nothing, with two evaluations."""
     folder = RunFolder(path)
-    config = api.configure(env, agent, changes=UNTRAINED)
-    training = api.build(config, folder)
-    folder.create(config)
-    policy.save(folder, config, training.state, 200)
+    config = api.configure(env, agent, changes={**UNTRAINED, **(changes or {})})
+    save_untrained(folder, config, 200)
     rows = [EVALUATED]
     for step in (100, 200):
         for task in ("hard", "uniform"):
@@ -92,5 +93,12 @@ def image_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def quick_decoder(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"IMAGES": 40, "COPIES": 5, "UPDATES": 2, "UPDATES_PER_CALL": 2}.items():
+    for name, value in {"IMAGES": 40, "NUM_ENVS": 5, "UPDATES": 2, "UPDATES_PER_CALL": 2}.items():
         monkeypatch.setattr(decoder, name, value)
+
+
+@pytest.fixture(scope="session")
+def leap_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run of an agent that plans, whose plans take no time."""
+    small = {"num_subgoals": 3, "plan_samples": 16, "plan_iterations": 2}
+    return untrained(tmp_path_factory.mktemp("runs") / "leap", "point-u", "leap", small)

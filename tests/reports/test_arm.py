@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from drawing_here import needs_renderer
+from midway import api
 from midway.cli.main import main
 from midway.envs.registry import make_vec
-from midway.reports import compose, report, strips, tabletop, watch, window
-from midway.reports.rollouts import Recording
+from midway.reports import decoder, images, recordings, report, tabletop, videos, watch
+from midway.reports.recordings import Recording
 from midway.reports.scenes import TableScene, Words
-from midway.training import api
-from midway.training.folder import RunFolder
+from midway.runs.folder import RunFolder
 from midway.types import ConfigurationError
 
 
@@ -44,15 +44,15 @@ def test_the_report_of_images_shows_what_is_imagined(image_run, tmp_path, quick_
 @needs_renderer
 def test_rows_of_images_are_those_of_the_environment(image_run, quick_decoder):
     loaded = api.load(image_run)
-    decode = strips.decoder_of(RunFolder(image_run), loaded)
-    rows = strips.rows(loaded, decode, "hard", 2, seed=3)
+    decode = decoder.of_policy(RunFolder(image_run), loaded)
+    rows = images.rows(loaded, decode, "hard", 2, seed=3)
     observation, _ = make_vec("push", num_envs=2, task="hard").reset(seed=3)
     np.testing.assert_array_equal(rows["state"], observation["observation"])
     np.testing.assert_array_equal(rows["goal"], observation["desired_goal"])
     assert len(rows) == 6
-    for images in rows.values():
-        assert images.shape == (2, 84, 84, 3)
-        assert images.dtype == np.uint8
+    for shown in rows.values():
+        assert shown.shape == (2, 84, 84, 3)
+        assert shown.dtype == np.uint8
 
 
 @needs_renderer
@@ -62,7 +62,7 @@ def test_without_a_drawing_library_images_are_missing_and_the_rest_is_drawn(
     def fail(*arguments, **options):
         raise ConfigurationError("images need OpenGL")
 
-    monkeypatch.setattr(compose.arm.environments, "make_vec", fail)
+    monkeypatch.setattr(recordings.environments, "make_vec", fail)
     page, *figures = report([image_run], tmp_path)
     assert stems(figures) == {"push-learning-curves", "push-distances"}
     assert "images need OpenGL" in page.read_text()
@@ -84,7 +84,7 @@ def test_a_video_of_images(image_run, tmp_path, quick_decoder):
 def episode(success):
     states = np.array([[0.1, 0.6, 0.0, 0.6], [0.0, 0.55, 0.0, 0.6]], np.float32)
     goal = np.array([0.0, 0.55, 0.1, 0.6], np.float32)
-    return Recording("hard", states, states, goal, states, goal, success, 0.1)
+    return Recording("hard", states, goal, states, goal, success, 0.1)
 
 
 def test_words_tell_hand_and_puck_apart(state_run):
@@ -143,8 +143,8 @@ def test_the_window_shows_the_frame(tmp_path, monkeypatch):
             with os.fdopen(read) as number:
                 monkeypatch.setenv("DISPLAY", f":{number.readline().strip()}")
             seen = []
-            window.check()
-            window.play(frames(tmp_path / "Xvfb_screen0", seen), 5, "test")
+            videos.check_display()
+            videos.play(frames(tmp_path / "Xvfb_screen0", seen), 5, "test")
         finally:
             server.terminate()
     assert seen[-1][40, 30].tolist() == [255, 0, 0]
@@ -155,7 +155,7 @@ def frames(screen, seen):
     """Yield a picture that is red above and blue below, until it is seen on the screen."""
     picture = np.zeros((150, 201, 3), np.uint8)
     picture[:75, :, 0] = picture[75:, :, 2] = 255
-    for _ in range(100):
+    while True:
         yield picture
         pixels = np.frombuffer(screen.read_bytes()[-400 * 300 * 4 :], np.uint8)
         seen.append(pixels.reshape(300, 400, 4)[..., 2::-1])

@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 
 from midway.envs.mazes import MAZES
-from midway.reports import compose, maps, report, study
+from midway.envs.registry import entry
+from midway.envs.views import MazeView
+from midway.reports import cache, compose, maze, report
+from midway.reports.cache import Episode, Study, is_flipped
 from midway.reports.curves import success_curve
 from midway.reports.difficulty import bins
 from midway.reports.health import PANELS, with_speed
 from midway.reports.imagined import density, halvings
-from midway.reports.rollouts import Recording
+from midway.reports.recordings import Recording
 from midway.reports.runs import groups
-from midway.reports.study import Episode, Study
 
 FIGURES = {"learning-curves", "ris-map", "difficulty", "ris-subgoals", "ris-values", "health"}
 
@@ -133,12 +135,12 @@ def test_several_environments_have_an_overview(ris_run, copy_run, tmp_path):
 
 def test_a_second_report_computes_nothing_again(single, ris_run, tmp_path, monkeypatch):
     out = shutil.copytree(single[0].parent, tmp_path / "out")
-    monkeypatch.setattr(study.policies, "load", None)
+    monkeypatch.setattr(cache.policies, "load", None)
     report([ris_run], out)
 
 
-def test_past_policies_are_moments_of_the_heat_map(ris_run, tmp_path):
-    """The run keeps eight moments; the policy is the last of them."""
+def test_past_policies_are_snapshots_of_the_heat_map(ris_run, tmp_path):
+    """The run keeps eight snapshots; the policy is the last of them."""
     run = compose.read(ris_run)
     assert list(run.past_weights) == [152, 304, 456, 600, 752, 904, 1056]
     looked = Study(run, tmp_path)
@@ -155,10 +157,10 @@ def test_without_past_policies_the_page_says_so(ris_run, copy_run, tmp_path):
 
 
 def test_the_maze_is_drawn_as_it_is():
-    maze = MAZES["omega"]
-    _, (axes,) = maps.panels(maze, 1)
+    omega = MAZES["omega"]
+    _, (axes,) = maze.panels(omega, 1)
     drawn = {(*patch.get_xy(), patch.get_width(), patch.get_height()) for patch in axes.patches}
-    assert drawn == {(*wall.low, 2 * wall.half_x, 2 * wall.half_y) for wall in maze.walls}
+    assert drawn == {(*wall.low, 2 * wall.half_x, 2 * wall.half_y) for wall in omega.walls}
     assert axes.get_aspect() == 1
 
 
@@ -208,12 +210,13 @@ def test_over_time_a_seed_that_is_done_keeps_its_last_success(ris_run, copy_run)
 def test_an_ant_on_its_back_is_noticed():
     state = np.zeros((2, 31), np.float32)
     state[:, [5, 7]] = 1
-    upright = Recording("hard", state, state, state[0], state, state[0], False, 1.0)
+    upright = Recording("hard", state, state[0], state, state[0], False, 1.0)
     state = state.copy()
     state[-1, 7] = -1
-    fallen = Recording("hard", state, state, state[0], state, state[0], False, 1.0)
-    table = study._episode_table([upright, fallen], MAZES["u"])
-    assert table["flipped"].tolist() == [0, 1]
+    fallen = Recording("hard", state, state[0], state, state[0], False, 1.0)
+    view = entry("ant-u").view
+    assert isinstance(view, MazeView)
+    assert [is_flipped(view, recording) for recording in (upright, fallen)] == [False, True]
 
 
 def test_every_panel_says_what_is_healthy():

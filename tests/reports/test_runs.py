@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 
 from midway.reports import report
-from midway.reports.runs import groups, read, read_table
+from midway.reports.runs import groups, read
+from midway.tables import read as read_table
 from midway.types import ConfigurationError
 
 

@@ -4,9 +4,10 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from midway.reports import imagination, videos, watch
-from midway.reports.rollouts import record
-from midway.training import api
+from midway import api
+from midway.reports import videos, watch
+from midway.reports.cache import chain
+from midway.reports.recordings import draws, record
 from midway.types import ConfigurationError
 
 
@@ -63,20 +64,21 @@ def test_recordings_are_whole_episodes(ris_run):
     recordings = record(policy, {"hard": 2, "uniform": 3}, seed=5)
     assert [recording.task for recording in recordings] == ["hard"] * 2 + ["uniform"] * 3
     for recording in recordings:
-        assert len(recording.achieved) == recording.length + 1
-        distance = np.linalg.norm(recording.achieved[-1, :2] - recording.goal[:2])
+        assert len(recording.states) == recording.length + 1
+        distance = np.linalg.norm(recording.states[-1, :2] - recording.goal[:2])
         assert distance == pytest.approx(recording.final_distance, abs=1e-5)
         assert recording.success == (distance < 0.5)
         assert recording.success or recording.length == 150
     again = record(policy, {"hard": 2, "uniform": 3}, seed=5)
-    np.testing.assert_array_equal(again[4].achieved, recordings[4].achieved)
+    np.testing.assert_array_equal(again[4].states, recordings[4].states)
 
 
 def test_imagined_subgoals_follow_their_distribution(ris_run):
     policy = api.load(ris_run)
     pair = np.zeros((1, 4), np.float32), np.ones((1, 4), np.float32)
-    location, scale = imagination.distribution(policy, *pair)
-    drawn = imagination.subgoals(policy, *pair, count=20_000)[0]
+    found = policy.subgoals(*pair)
+    location, scale = (part.achieved_goal for part in found)
+    drawn = draws(found, count=20_000)[0]
     np.testing.assert_allclose(np.median(drawn, 0), location[0], atol=0.05 * scale.max())
     np.testing.assert_allclose(np.abs(drawn - location).mean(0), scale[0], rtol=0.05)
 
@@ -84,9 +86,9 @@ def test_imagined_subgoals_follow_their_distribution(ris_run):
 def test_a_chain_halves_the_way_again_and_again(ris_run):
     policy = api.load(ris_run)
     start, goal = np.zeros(4, np.float32), np.ones(4, np.float32)
-    way = imagination.chain(policy, start, goal, 2)
+    way = chain(policy, start, goal, 2)
     assert way.shape == (3, 4)
-    middle = imagination.distribution(policy, start[None], goal[None])[0][0]
-    last = imagination.distribution(policy, middle[None], goal[None])[0][0]
+    middle = policy.subgoals(start[None], goal[None]).location.achieved_goal[0]
+    last = policy.subgoals(middle[None], goal[None]).location.achieved_goal[0]
     np.testing.assert_allclose(way[1], middle, rtol=1e-5)
     np.testing.assert_allclose(way[2], last, rtol=1e-5)

@@ -15,17 +15,18 @@ from typing import Any
 import jax
 import numpy as np
 
+from midway import api
 from midway.agents import ris
 from midway.envs.push import IMAGE_SPEC
 from midway.networks import encoder as encoders
 from midway.replay import buffer
-from midway.training import api, codes, step
+from midway.runs.folder import RunFolder
+from midway.training import freeze, loop, state, step
 from midway.training.arrays import named_arrays
 from midway.training.checkpoint import Checkpoints
 from midway.training.compilation import use_compilation_cache
 from midway.training.devices import Devices
-from midway.training.folder import RunFolder
-from midway.training.loop import Training
+from midway.training.state import Training
 
 NUMBER = 4
 SMALL = {
@@ -39,12 +40,12 @@ SMALL = {
 
 def build(folder: Path, devices: int) -> Training:
     config = api.configure("point-u", "ris", changes={**SMALL, "devices": devices})
-    return api.build(config, RunFolder(folder))
+    return state.start(api.setup_of(config, RunFolder(folder)))
 
 
 def advance(training: Training, updates: int) -> None:
-    while training.updates < updates:
-        training.advance()
+    while training.counters.updates < updates:
+        loop.advance(training)
 
 
 def write(path: Path, training: Training) -> None:
@@ -69,11 +70,12 @@ def sent(program: str) -> list[int]:
 
 def look(training: Training) -> dict[str, Any]:
     """Return how the run lies on its devices; advances it by one call."""
-    learner: Any = training.learner
+    program: Any = training.program
     observations = training.replay.rows["observation"]
-    arguments = (training.arrays, training.totals, training.replay, training._update_key)
-    updates = jax.device_put(np.int32(0), training._update_key.sharding)
-    compiled = learner.train.lower(*arguments, updates).compile()
+    key = training.streams.update_key
+    arguments = (training.arrays, training.totals, training.replay, key)
+    updates = jax.device_put(np.int32(0), key.sharding)
+    compiled = program.train.lower(*arguments, updates).compile()
     lanes = [s.data.shape[0] for s in observations.addressable_shards]
     lane_size = observations[0].size
     before = pointers(training.replay)
@@ -81,11 +83,11 @@ def look(training: Training) -> dict[str, Any]:
     with jax.transfer_guard("disallow"):
         training.arrays, training.totals = compiled(*arguments, updates)
         jax.block_until_ready(training.arrays)
-    training.replay = training.collector.step(training.replay, training._choose)
+    training.replay = training.collector.step(training.replay, partial(loop._choose, training))
     return {
-        "compilations": {n: getattr(learner, n)._cache_size() for n in ("train", "act")},
+        "compilations": {n: getattr(program, n)._cache_size() for n in ("train", "act")},
         "lanes": lanes,
-        "copies": [len(a.sharding.device_set) for a in jax.tree.leaves(training.arrays)],
+        "replicas": [len(a.sharding.device_set) for a in jax.tree.leaves(training.arrays)],
         "largest_sent": max(sent(compiled.as_text())),
         "numbers_in_a_lane": lane_size,
         "in_place": before == pointers(training.replay),
@@ -93,24 +95,24 @@ def look(training: Training) -> dict[str, Any]:
     }
 
 
-def codes_of_lanes() -> dict[str, Any]:
-    """Return how the codes of a replay of images lie, and how far they are from one device's."""
+def features_of_lanes() -> dict[str, Any]:
+    """Return how the features of a replay of images lie, and how far they are from one device's."""
     spec = replace(IMAGE_SPEC, observation_shape=(31, 31, 3))
     encoder = encoders.create(spec, ris.Config(), jax.random.key(0))
     observation = np.random.default_rng(0).integers(0, 256, (8, 31, 31, 3), np.uint8)
-    state = np.zeros((8, 4), np.float32)
+    positions = np.zeros((8, 4), np.float32)
     seen = {"observation": observation, "desired_goal": observation[::-1]}
-    seen |= {"achieved_state": state, "desired_state": state}
+    seen |= {"achieved_state": positions, "desired_state": positions}
     found = []
     for number in (1, NUMBER):
         replay = Devices.first(number).allocate(partial(buffer.create, spec, 1_632, 8))
         replay = step.begin(replay, seen, np.ones(8, np.bool_))
-        found.append(codes.encoded(replay, encoder).rows["observation"])
+        found.append(freeze.encoded_replay(replay, encoder).rows["observation"])
     difference = float(np.abs(np.asarray(found[0]) - np.asarray(found[1])).max())
     return {
-        "lanes_of_codes": [s.data.shape[0] for s in found[1].addressable_shards],
-        "difference_of_codes": difference,
-        "largest_code": float(np.abs(np.asarray(found[0])).max()),
+        "lanes_of_features": [s.data.shape[0] for s in found[1].addressable_shards],
+        "difference_of_features": difference,
+        "largest_feature": float(np.abs(np.asarray(found[0])).max()),
     }
 
 
@@ -121,18 +123,18 @@ def main(folder: Path) -> None:
         advance(training, 8)
         write(folder / f"start-{number}.npz", training)
         checkpoints = Checkpoints(folder / f"checkpoints-{number}")
-        checkpoints.save(training.steps, training.state_dict())
+        checkpoints.save(training.counters.steps, state.state_dict(training))
         checkpoints.close()
     for number, other in ((1, NUMBER), (NUMBER, 1)):
         checkpoints = Checkpoints(folder / f"checkpoints-{number}")
         resumed = build(folder, other)
-        resumed.restore(checkpoints, resumed_at(checkpoints))
+        resumed = state.restore(resumed, checkpoints, resumed_at(checkpoints))
         advance(resumed, 16)
         write(folder / f"{number}-then-{other}.npz", resumed)
         checkpoints.close()
     advance(trainings[1], 16)
     write(folder / "1-then-1.npz", trainings[1])
-    found = look(trainings[NUMBER]) | codes_of_lanes()
+    found = look(trainings[NUMBER]) | features_of_lanes()
     (folder / "found.json").write_text(json.dumps(found))
 
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import midway
-from midway.training import api
-from midway.training.folder import RunFolder
+from midway import api
+from midway.runs.folder import RunFolder
+from midway.training import state
 from midway.types import ConfigurationError
 
 
@@ -63,7 +64,7 @@ def test_runs_continue_on_another_number_of_devices(
 
 def test_each_device_holds_its_lanes_and_all_networks(found: dict[str, Any]) -> None:
     assert found["lanes"] == [2, 2, 2, 2]
-    assert set(found["copies"]) == {4}
+    assert set(found["replicas"]) == {4}
 
 
 def test_devices_send_rows_that_are_drawn_and_never_the_replay(found: dict[str, Any]) -> None:
@@ -71,8 +72,8 @@ def test_devices_send_rows_that_are_drawn_and_never_the_replay(found: dict[str, 
 
 
 def test_each_device_encodes_the_images_of_its_lanes(found: dict[str, Any]) -> None:
-    assert found["lanes_of_codes"] == [2, 2, 2, 2]
-    assert found["difference_of_codes"] < 1e-5 < found["largest_code"]
+    assert found["lanes_of_features"] == [2, 2, 2, 2]
+    assert found["difference_of_features"] < 1e-5 < found["largest_feature"]
 
 
 def test_everything_compiles_once_and_is_written_in_place(found: dict[str, Any]) -> None:
@@ -97,7 +98,7 @@ def test_rows_that_cannot_be_divided_are_refused(changes: dict[str, int], named:
 def test_more_devices_than_there_are_is_refused(tmp_path: Path) -> None:
     config = api.configure("point-u", changes={"devices": 2})
     with pytest.raises(ConfigurationError, match="devices 2: this machine has 1"):
-        api.build(config, RunFolder(tmp_path))
+        state.start(api.setup_of(config, RunFolder(tmp_path)))
     RunFolder(tmp_path / "run").create(api.configure("point-u"))
     with pytest.raises(ConfigurationError, match="devices 2: this machine has 1"):
         midway.resume(tmp_path / "run", devices=2)

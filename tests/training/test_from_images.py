@@ -14,6 +14,7 @@ from drawing_here import needs_renderer
 from midway.envs.push import IMAGE_SPEC
 from midway.replay import buffer
 from midway.training import loop
+from midway.training.state import Training
 
 IMAGES = SMALL | {"encoder_batch_size": 4}
 
@@ -27,22 +28,22 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 @needs_renderer
-@pytest.mark.parametrize("encoder_updates", [8, 15_000], ids=["codes", "images"])
+@pytest.mark.parametrize("freeze_after", [8, 15_000], ids=["features", "images"])
 def test_exact_resume_with_images(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoder_updates: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, freeze_after: int
 ) -> None:
-    """Stopped after the twelfth update, where the replay holds codes or still images."""
-    changes = IMAGES | {"encoder_updates": encoder_updates}
+    """Stopped after the twelfth update, where the replay holds features or still images."""
+    changes = IMAGES | {"freeze_encoder_after": freeze_after}
     whole = midway.train("push", seed=1, out=tmp_path / "whole", changes=changes)
-    advance = loop.Training.advance
+    advance = loop.advance
 
-    def interrupted(training: loop.Training) -> None:
+    def interrupted(training: Training) -> None:
         advance(training)
-        if training.steps == 44:
+        if training.counters.steps == 44:
             signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop.Training, "advance", interrupted)
+        patch.setattr(loop, "advance", interrupted)
         run = midway.train("push", seed=1, out=tmp_path / "run", changes=changes)
     assert not run.finished
     assert midway.resume(run.path).finished

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from midway import api
 from midway.envs.registry import make_vec
 from midway.reports.runs import read
-from midway.training import api
+from midway.runs.folder import RunFolder
+from midway.training import loop, state
 from midway.training.evaluate import run_episodes
-from midway.training.folder import RunFolder
 
 TINY = {
     "hidden": (8,),
@@ -48,11 +49,11 @@ def test_an_ant_on_its_back_is_flipped_and_one_on_its_side_is_not() -> None:
 
 def test_the_share_of_steps_on_its_back_is_logged_and_begins_anew() -> None:
     config = api.configure("ant-u", changes={**TINY, "random_steps": 400})
-    training = api.build(config, RunFolder(Path("unused")))
+    training = state.start(api.setup_of(config, RunFolder(Path("unused"))))
     env = training.collector.env
-    training.advance()
+    loop.advance(training)
     env.batch.bind("qpos")[1, 2:7] = (5.0, *ON_ITS_BACK)
-    training.advance()
+    loop.advance(training)
     assert training.collector.take_metrics()["collect/flip_rate"] == 1 / 8
     assert np.isnan(training.collector.take_metrics()["collect/flip_rate"])
 

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from midway import presets
+from midway import api, presets
 from midway.agents.registry import AGENTS
 from midway.envs.registry import ENVIRONMENTS, make_vec
-from midway.training import api, progress
+from midway.runs.folder import RunConfig, RunFolder
+from midway.tables import Appender
+from midway.training import loop, progress, state
 from midway.training.arrays import named_arrays, with_named_arrays
 from midway.training.config import TrainConfig
 from midway.training.evaluate import run_episodes
-from midway.training.folder import RunConfig, RunFolder
-from midway.training.logging import Table
 from midway.types import ConfigurationError
 
 TINY = {"hidden": (8,), "batch_size": 8, "num_envs": 4, "replay_capacity": 2_000}
@@ -52,12 +52,12 @@ def test_settings_must_be_positive(name: str) -> None:
 @pytest.mark.parametrize("preset", ["paper", "quick"])
 @pytest.mark.parametrize("env", ENVIRONMENTS)
 def test_every_preset_survives_its_file(agent: str, preset: str, env: str) -> None:
-    config = RunConfig(env, agent, preset, 3, *presets.preset(env, agent, preset))
+    config = RunConfig(env, agent, preset, 3, *presets.resolve(env, agent, preset)[:2])
     assert RunConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
 
 
 def test_paper_preset_is_table_1() -> None:
-    train, ris = presets.preset("ant-u", "ris", "paper")
+    train, ris = presets.resolve("ant-u", "ris", "paper")[:2]
     assert (train.batch_size, train.updates_per_step, train.replay_capacity) == (2048, 1, 10**6)
     assert (ris.discount, ris.target_update_rate, ris.epsilon) == (0.99, 5e-3, 1e-16)
     rates = (ris.critic_learning_rate, ris.policy_learning_rate, ris.subgoal_learning_rate)
@@ -66,13 +66,13 @@ def test_paper_preset_is_table_1() -> None:
 
 
 def test_paper_preset_of_the_arm_is_the_other_column_of_table_1() -> None:
-    train, ris = presets.preset("push", "ris", "paper")
+    train, ris = presets.resolve("push", "ris", "paper")[:2]
     assert (train.batch_size, train.updates_per_step) == (256, 1)
     assert 100_000 <= train.replay_capacity * 100 / 102 < 101_000
     rates = (ris.critic_learning_rate, ris.policy_learning_rate, ris.subgoal_learning_rate)
     assert rates == (1e-3, 1e-4, 1e-4)
     assert (ris.epsilon, ris.encoder_learning_rate) == (1e-4, 1e-4)
-    assert presets.preset("push", "sac", "paper")[1].policy_learning_rate == 1e-4
+    assert presets.resolve("push", "sac", "paper").hyperparameters.policy_learning_rate == 1e-4
 
 
 def test_changes_take_text_and_keep_types() -> None:
@@ -87,12 +87,12 @@ def test_changes_take_text_and_keep_types() -> None:
 
 def test_table_keeps_rows_up_to_a_step_and_drops_a_torn_line(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
-    table = Table(path, until=0)
+    table = Appender(path, until=0)
     for step in (10, 20, 30):
         table.write({"step": step, "loss": step / 2, "note": ""})
     with path.open("a") as file:
         file.write("4")
-    Table(path, until=20).write({"step": 25, "loss": 1.0, "later": "not a column"})
+    Appender(path, until=20).write({"step": 25, "loss": 1.0, "later": "not a column"})
     with path.open(newline="") as file:
         rows = list(csv.reader(file))
     assert rows == [
@@ -117,19 +117,19 @@ def test_arrays_by_name_come_back_or_are_refused() -> None:
 def test_training_compiles_once_and_moves_nothing_to_the_host(tmp_path: Path) -> None:
     """A call of several updates transfers nothing; a run traces sampling and update once."""
     config = api.configure("point-u", "ris", changes={**TINY, "random_steps": 40})
-    training = api.build(config, RunFolder(tmp_path))
-    while training.updates < 40:
-        training.advance()
-    assert training.learner.train._cache_size() == 1  # type: ignore[attr-defined]
+    training = state.start(api.setup_of(config, RunFolder(tmp_path)))
+    while training.counters.updates < 40:
+        loop.advance(training)
+    assert training.program.train._cache_size() == 1  # type: ignore[attr-defined]
     key, updates = jax.random.key(0), jax.numpy.asarray(0)
     arguments = (training.arrays, training.totals, training.replay, key, updates)
-    compiled = jax.jit(training.learner.train).lower(*arguments).compile()
+    compiled = jax.jit(training.program.train).lower(*arguments).compile()
     with jax.transfer_guard("disallow"):
         jax.block_until_ready(compiled(*arguments))
 
 
 class Line:
-    """One-dimensional walk for evaluation: each copy starts as far away as its number says."""
+    """One-dimensional walk for evaluation: each starts as far away as its number says."""
 
     tasks = ("near",)
 
@@ -157,7 +157,7 @@ class Line:
         return self.observe(), None, self.left <= 0, self.elapsed >= 3, info
 
 
-def test_evaluation_records_the_first_episode_of_every_copy() -> None:
+def test_evaluation_records_the_first_episode_of_every_environment() -> None:
     result = run_episodes(Line(5), lambda o, g: np.zeros((5, 1)), "near", "mean", seed=0)
     assert [e.success for e in result.episodes] == [True, True, True, False, False]
     assert [e.length for e in result.episodes] == [1, 2, 3, 3, 3]
@@ -189,11 +189,11 @@ def test_bar_shows_the_same_on_a_terminal(capsys: pytest.CaptureFixture[str]) ->
 def test_collected_episodes_are_counted() -> None:
     env = make_vec("point-u", num_envs=2)
     config = api.configure("point-u", changes={**TINY, "num_envs": 2, "random_steps": 400})
-    training = api.build(config, RunFolder(Path("unused")))
-    while training.steps < 310:
-        training.advance()
+    training = state.start(api.setup_of(config, RunFolder(Path("unused"))))
+    while training.counters.steps < 310:
+        loop.advance(training)
     counts = training.collector.counts
     assert env.goal_spec.max_episode_steps == 150
     assert counts.episodes >= 2
     assert counts.metrics()["collect/episode_length"] <= 150
-    assert counts.length <= training.steps
+    assert counts.length <= training.counters.steps

@@ -4,19 +4,20 @@ import csv
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
 import midway
-from midway.agents import leap, sac, tdm
-from midway.reports import reconstructions, runs
-from midway.training import pretrain
-from midway.training.evaluate import run_episodes
-from midway.training.folder import RunFolder
-from midway.training.progress import Silent
-from midway.types import ConfigurationError, NonFiniteError, Pretraining
+from midway import api
+from midway.agent import PretrainSettings
+from midway.agents import leap, tdm
+from midway.runs.folder import RunFolder
+from midway.training import pretrain, state
+from midway.training.evaluate import rollout
+from midway.types import ConfigurationError, NonFiniteError
 
 TINY: dict[str, Any] = {
     "hidden": (8, 8),
@@ -67,10 +68,10 @@ def same_numbers(first: Path, second: Path, without: tuple[str, ...]) -> bool:
 
 def test_states_are_those_of_resets_and_of_random_steps() -> None:
     env = midway.make_vec("point-u", num_envs=50)
-    at_rest = pretrain.sample_states(env, Pretraining(("vae",), 120, 0, 1), 1)
+    at_rest = pretrain.sample_states(env, PretrainSettings(("vae",), 120, 0, 1), 1)
     assert at_rest.observation.shape == at_rest.achieved_goal.shape == (120, 4)
     np.testing.assert_array_equal(at_rest.observation[:, 2:], 0)
-    moved = pretrain.sample_states(env, Pretraining(("vae",), 200, 1, 1), 1)
+    moved = pretrain.sample_states(env, PretrainSettings(("vae",), 200, 1, 1), 1)
     speeds = np.abs(np.asarray(moved.observation)[:, 2:]).sum(1)
     np.testing.assert_array_equal(speeds[:50], 0)  # resets and steps take turns
     assert (speeds[50:100] > 0).mean() > 0.9
@@ -81,7 +82,7 @@ def test_states_are_those_of_resets_and_of_random_steps() -> None:
 
 def test_same_seed_same_states() -> None:
     env = midway.make_vec("point-u", num_envs=20)
-    settings = Pretraining(("vae",), 60, 2, 1)
+    settings = PretrainSettings(("vae",), 60, 2, 1)
     first, again, other = (pretrain.sample_states(env, settings, s).observation for s in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
@@ -119,34 +120,31 @@ def test_a_source_that_does_not_fit_is_refused(run: Path, tmp_path: Path) -> Non
 
 
 def test_agents_without_the_stage_are_left_as_they_are(tmp_path: Path) -> None:
-    state = object()
-    folder = RunFolder(tmp_path)
+    changes = {name: value for name, value in TDM.items() if name != "max_steps_left"}
+    config = api.configure("point-u", "sac", changes=changes)
+    said: list[str] = []
+    training = state.start(api.setup_of(config, RunFolder(tmp_path)), said.append)
+    assert training.counters.seconds == 0
+    assert said == []
+    assert list(tmp_path.iterdir()) == []
 
-    def no_env(num_envs: int, task: str) -> Any:
-        raise AssertionError("no environment is needed")
 
-    assert pretrain.run(sac, state, no_env, 0, folder, Silent()) == (state, 0.0)
+def test_a_run_that_is_about_to_be_restored_leaves_pretraining_out(tmp_path: Path) -> None:
+    setup = api.setup_of(api.configure("point-u", "leap", changes=TINY), RunFolder(tmp_path))
+    state.start(setup)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_loss_that_is_not_finite_ends_the_stage(tmp_path: Path) -> None:
     env = midway.make_vec("point-u", num_envs=20)
-    config = leap.Config(
-        hidden=(8,), vae_states=100, vae_rounds=4, vae_updates=5, vae_learning_rate=float("nan")
-    )
-    state = leap.create(config, env.goal_spec, jax.random.key(0))
+    config = leap.Config(hidden=(8,), vae_states=100, vae_rounds=4, vae_updates=5)
+    start = leap.create(config, env.goal_spec, jax.random.key(0))
+    broken = jax.tree.map(lambda x: x * np.nan, start.vae.decoder)
+    start = eqx.tree_at(lambda s: s.vae.decoder, start, broken)
+    ability = leap.AGENT.pretrain
+    assert ability is not None
     with pytest.raises(NonFiniteError, match=r"became nan in round 1 of pre-training"):
-        pretrain.run(leap, state, lambda n, t: env, 0, RunFolder(tmp_path), Silent())
-
-
-def test_what_the_autoencoder_keeps_is_drawn(run: Path) -> None:
-    data = runs.read(run)
-    assert reconstructions.has_autoencoder(data)
-    states, decoded = reconstructions.reconstruct(data)
-    assert states.shape == decoded.shape == (reconstructions.COUNT, 4)
-    figure = reconstructions.draw(data, "leap")
-    error = np.linalg.norm((states - decoded)[:, :2], axis=1).mean()
-    assert f"mean error {error:.2f} m" in figure.axes[0].get_title().replace("\n", " ")
+        pretrain.run(ability, start, lambda n, t: env, 0, tmp_path, lambda text: None)
 
 
 # --- whole runs of agents that remember -----------------------------------------------------------
@@ -178,8 +176,9 @@ def test_loaded_policies_plan(run: Path) -> None:
     actor(*pair)
     np.testing.assert_array_equal(actor.memory.latents, plan)  # the segment is not over
     assert actor.memory.elapsed.tolist() == [2, 2]
-    actor.restart(np.array([True, False]))
-    assert actor.memory.elapsed.tolist() == [0, 2]
+    actor.rest(np.array([True, False]))
+    assert actor.memory.elapsed[0] > env.goal_spec.max_episode_steps
+    assert actor.memory.elapsed[1] == 2
     assert policy(pair[0][0], pair[1][0]).shape == (2,)
 
 
@@ -189,8 +188,14 @@ def test_evaluation_plans_and_is_reproducible(run: Path) -> None:
     assert len(result.episodes) == 3
 
 
-def test_time_is_remembered_through_an_episode(run: Path) -> None:
+def test_time_is_remembered_until_an_episode_is_over(run: Path) -> None:
     env = midway.make_vec("point-u", num_envs=2, task="hard")
-    actor = midway.load(run).actor()
-    run_episodes(env, actor, "hard", "mean", 0)
-    assert actor.memory.elapsed.tolist() == [env.goal_spec.max_episode_steps] * 2
+    actor, seen = midway.load(run).actor(), []
+    observation, _ = env.reset(seed=0, options={"task": "hard"})
+    for moment in rollout(env, actor, observation):
+        seen.append(actor.memory.elapsed.tolist())
+        running = moment.running
+    steps = len(seen)
+    assert steps <= env.goal_spec.max_episode_steps
+    longest = int(np.flatnonzero(running)[0])
+    assert [row[longest] for row in seen] == list(range(1, steps + 1))

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 
 import midway
-from midway.training import api, loop
+from midway import api
+from midway.runs.folder import RunFolder
+from midway.runs.policy import load
+from midway.training import loop, state
 from midway.training.checkpoint import Checkpoints
-from midway.training.folder import RunFolder
-from midway.training.policy import load
+from midway.training.state import Training
 from midway.types import ConfigurationError, NonFiniteError
 
 SMALL = {
@@ -32,7 +34,7 @@ SMALL = {
     "checkpoint_every": 100,
     "steps": 400,
 }
-MOMENTS = (52, 100, 152, 200, 252, 300, 352, 400)
+SNAPSHOTS = (52, 100, 152, 200, 252, 300, 352, 400)
 TIMES = ("seconds", "training_seconds")
 
 
@@ -64,14 +66,14 @@ def agent_of(path: Path) -> str:
 
 def interrupt_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
     """Send this process the signal of Ctrl-C once the run has taken this many steps."""
-    advance = loop.Training.advance
+    advance = loop.advance
 
-    def interrupted(training: loop.Training) -> None:
+    def interrupted(training: Training) -> None:
         advance(training)
-        if training.steps == steps:
+        if training.counters.steps == steps:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(loop.Training, "advance", interrupted)
+    monkeypatch.setattr(loop, "advance", interrupted)
 
 
 @pytest.mark.parametrize("stop", [20, 100, 132, 236])
@@ -161,17 +163,17 @@ def test_updates_keep_their_ratio_exactly(whole_run: Path) -> None:
 def test_non_finite_loss_stops_the_run_and_keeps_the_last_good_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    metrics = loop.Training.metrics
+    metrics = loop.metrics
 
-    def poisoned(training: loop.Training) -> dict[str, float]:
-        if training.steps > 200:
+    def poisoned(training: Training) -> dict[str, float]:
+        if training.counters.steps > 200:
             training.totals = {
                 **training.totals,
                 "critic/loss": training.totals["critic/q"] * np.nan,
             }
         return metrics(training)
 
-    monkeypatch.setattr(loop.Training, "metrics", poisoned)
+    monkeypatch.setattr(loop, "metrics", poisoned)
     with pytest.raises(NonFiniteError, match="critic/loss became nan"):
         midway.train("point-u", out=tmp_path / "run", changes=SMALL)
     assert Checkpoints(tmp_path / "run" / "checkpoints").latest() == 200
@@ -185,14 +187,14 @@ def test_policy_loads_alone_and_acts_like_the_run(whole_run: Path, tmp_path: Pat
         (alone / name).write_bytes((whole_run / name).read_bytes())
     policy = midway.load(alone)
     config = RunFolder(whole_run).load_config()
-    training = api.build(config, RunFolder(whole_run))
+    training = state.start(api.setup_of(config, RunFolder(whole_run)))
     checkpoints = Checkpoints(whole_run / "checkpoints")
-    training.restore(checkpoints, 400)
+    training = state.restore(training, checkpoints, 400)
     observation = training.collector.observation
     pair = observation["observation"], observation["desired_goal"]
     actions = policy(*pair)
     assert actions.shape == (4, 2)
-    np.testing.assert_allclose(actions, training.policy("mean")(*pair), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(actions, loop.policy(training, "mean")(*pair), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(policy(pair[0][1], pair[1][1]), actions[1], rtol=1e-5, atol=1e-6)
 
 
@@ -220,14 +222,14 @@ def test_foreign_and_damaged_folders_are_refused(whole_run: Path, tmp_path: Path
         (tmp_path / name).write_bytes((whole_run / name).read_bytes())
     folder.policy_weights.write_bytes(b"nothing")
     with pytest.raises(ConfigurationError, match="cannot be read"):
-        load(folder, midway.make_vec("point-u").goal_spec)
+        load(folder)
     with pytest.raises(ConfigurationError, match="not empty"):
         midway.train("point-u", out=whole_run)
 
 
-def test_weights_of_several_moments_are_kept(whole_run: Path) -> None:
+def test_snapshots_of_the_weights_are_kept(whole_run: Path) -> None:
     kept = {path.name for path in (whole_run / "policies").iterdir()}
-    assert kept == {f"step-{step}.safetensors" for step in MOMENTS}
+    assert kept == {f"step-{step}.safetensors" for step in SNAPSHOTS}
 
 
 def test_tensorboard_events_are_written(whole_run: Path) -> None:

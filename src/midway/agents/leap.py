@@ -14,57 +14,44 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, Key, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from midway import functional
+from midway.agent import Agent, EpisodeMemory, Freezing, Pretrain, PretrainSettings
 from midway.agents import tdm
+from midway.networks import encoder as encoders
 from midway.networks import optimizer
 from midway.networks import vae as vaes
-from midway.networks.vae import ImageVAE, StateVAE
+from midway.networks.vae import ImageVAE, LatentMean, StateVAE
 from midway.planning import cem
-from midway.types import Batch, EnvSpec, Metrics, Pretraining, Subgoal
+from midway.settings import setting
+from midway.types import EnvSpec, Metrics, Subgoal
 
 
 @dataclass(frozen=True)
 class Config(tdm.Config):
-    """Hyperparameters of LEAP, those of TDM included; the defaults are those of the ant.
+    """Hyperparameters of LEAP, those of TDM included; the defaults are those of the ant."""
 
-    Attributes:
-        num_subgoals: Subgoals of a plan at the start of an episode (table 2).
-        latent_size: Latent numbers of a subgoal (appendix D).
-        vae_hidden: Hidden layers of the encoder of states; the decoder's are the reverse.
-        vae_kl_weight: Weight of the KL divergence to the prior of the latent numbers.
-        vae_learning_rate: Adam's rate for the autoencoder.
-        vae_states: States that it is trained on, of which every tenth is held out.
-        vae_random_actions: Random actions after each reset; the states before and after each are
-            used.
-        vae_rounds: Rounds of its training.
-        vae_updates: Updates in each round.
-        vae_batch_size: States in the batch of one of its updates.
-        vae_source: Run folder whose autoencoder is taken instead, or nothing.
-        plan_samples: Candidates in each iteration of the planner.
-        plan_iterations: Iterations of the planner.
-        plan_elites: Shares of candidates that it is refitted to, each for an equal part of them.
-        plan_std: Standard deviation of the latent numbers in its first iteration.
-        prior_weight: Weight of the subgoals' log-density among the latent numbers.
-    """
-
-    num_subgoals: int = 11
-    latent_size: int = 8
-    vae_hidden: tuple[int, ...] = (64, 128, 64)
-    vae_kl_weight: float = 0.01
-    vae_learning_rate: float = 1e-3
-    vae_states: int = 50_000
-    vae_random_actions: int = 1
-    vae_rounds: int = 2_500
-    vae_updates: int = 100
-    vae_batch_size: int = 128
-    vae_source: str = ""
-    plan_samples: int = 10_000
-    plan_iterations: int = 50
-    plan_elites: tuple[float, ...] = (0.25, 0.01)
-    plan_std: float = 1.5
-    prior_weight: float = 0.1
+    num_subgoals: int = setting(11, "table 2", "of a plan at the start of an episode", least=1)
+    latent_size: int = setting(8, "appendix D", "latent numbers of a subgoal", least=1)
+    vae_hidden: tuple[int, ...] = setting((64, 128, 64), "appendix D", "of the encoder", least=1)
+    vae_kl_weight: float = setting(
+        1e-4, "leap.md", "β", least=0, deviates="1e-2 of the code loses the position"
+    )
+    vae_learning_rate: float = setting(1e-3, "code of LEAP", "Adam, VAE", above=0, most=1)
+    vae_states: int = setting(50_000, "code of LEAP", "data; a tenth is held out", least=10)
+    vae_random_actions: int = setting(
+        0, "leap.md", "after each reset", least=0, deviates="1 of the code loses the position"
+    )
+    vae_rounds: int = setting(2_500, "code of LEAP", "epochs", least=1)
+    vae_updates: int = setting(100, "code of LEAP", "of each round", least=1)
+    vae_batch_size: int = setting(128, "code of LEAP", "states of one update", least=1)
+    vae_source: str = setting("", "none", "run folder whose VAE is taken instead")
+    plan_samples: int = setting(10_000, "code of LEAP", "of an iteration of CEM", least=1)
+    plan_iterations: int = setting(50, "code of LEAP", "of CEM", least=1)
+    plan_elites: tuple[float, ...] = setting((0.25, 0.01), "code of LEAP", above=0, most=1)
+    plan_std: float = setting(1.5, "code of LEAP", "of latents at first", above=0)
+    prior_weight: float = setting(0.1, "code of LEAP", "c, of the latents' density", least=0)
 
 
 class State(tdm.State):
@@ -74,9 +61,6 @@ class State(tdm.State):
     vae_optimizer: optax.OptState
     config: Config = eqx.field(static=True)
 
-
-NETWORKS = (*tdm.NETWORKS, "vae")
-"""The parts of the state that a saved policy holds."""
 
 NUM_MEASURED = 1_000
 """Held-out states that are reconstructed at the end of each round."""
@@ -105,34 +89,22 @@ def segment_steps(config: Config, spec: EnvSpec) -> int:
     return min(equal_part, config.max_steps_left + 1)
 
 
-def codes(state: State, observation: Shaped[Array, "*B"]) -> Float[Array, "..."]:
-    """Return what the TDM reads: states in its units, or the latent means of images."""
-    if state.spec.is_image:
-        return state.vae.encode(observation).mean
-    return state.encoder(observation.astype(jnp.float32))
-
-
-def subgoal_codes(state: State, latent: Float[Array, "*B L"]) -> Subgoal:
+def subgoals_of(state: State, latent: Float[Array, "*B L"]) -> Subgoal:
     """Return the subgoals that latent numbers stand for, as the TDM reads them.
 
     States are decoded; images are decoded and encoded again, so that the TDM meets no latent
     numbers but those of images (original code).
     """
     decoded = state.vae.decode(latent)
-    if state.spec.is_image:
+    if state.spec.image_shape:
         decoded = state.vae.encode(decoded).mean
     decoded = state.encoder(decoded)
-    if state.spec.goal_is_observation:
-        return Subgoal(decoded, decoded)
-    size = state.spec.observation_shape[0]
-    return Subgoal(decoded[..., :size], decoded[..., size:])
+    return encoders.as_subgoal(state.spec, decoded)
 
 
-def vae_inputs(spec: EnvSpec, states: Subgoal) -> Shaped[Array, "N ..."]:
-    """Return what the autoencoder reads of states: both roles where they differ."""
-    if spec.goal_is_observation:
-        return states.observation
-    return jnp.concatenate(states, axis=-1)
+def planned(state: State, memory: "Memory") -> Float[Array, "B N G"]:
+    """Return the subgoals of the running plans, as achieved goals in the environment's units."""
+    return state.encoder.states(subgoals_of(state, memory.latents).achieved_goal)
 
 
 # --- plan -----------------------------------------------------------------------------------------
@@ -159,7 +131,7 @@ def score(
         i: Int[Array, ""], carry: tuple[Float[Array, "S O"], Float[Array, " S"]]
     ) -> tuple[Float[Array, "S O"], Float[Array, " S"]]:
         start, worst = carry
-        subgoal = subgoal_codes(state, latents[:, jnp.minimum(i, last - 1)])
+        subgoal = subgoals_of(state, latents[:, jnp.minimum(i, last - 1)])
         aim = jnp.where(i == last, goals, subgoal.achieved_goal)
         return subgoal.observation, jnp.minimum(worst, tdm.value(state, start, aim, steps_left))
 
@@ -212,23 +184,12 @@ def plan_where_due(
     return plans
 
 
-# --- losses and update ----------------------------------------------------------------------------
+# --- the autoencoder ----------------------------------------------------------------------------
 
 
-def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
-    """Return the state after one update of the TDM; the autoencoder stays as it is."""
-    if state.spec.is_image:
-        batch = batch._replace(
-            observation=codes(state, batch.observation),
-            next_observation=codes(state, batch.next_observation),
-            goal=codes(state, batch.goal),
-        )
-    return tdm.update(state, batch, key)
-
-
-def pretraining(config: Config) -> Pretraining:
+def pretrain_settings(config: Config) -> PretrainSettings:
     """Return how much there is to learn before the first update."""
-    return Pretraining(
+    return PretrainSettings(
         networks=("vae",),
         states=config.vae_states,
         random_actions=config.vae_random_actions,
@@ -242,7 +203,7 @@ def pretrain(state: State, states: Subgoal, key: Key[Array, ""]) -> tuple[State,
 
     The last tenth of the states is held out; a part of it is measured at the end of the round.
     """
-    inputs = vae_inputs(state.spec, states)
+    inputs = encoders.as_vector(state.spec, states)
     num_training = len(inputs) * 9 // 10
 
     def one(state: State, key: Key[Array, ""]) -> tuple[State, Metrics]:
@@ -254,6 +215,11 @@ def pretrain(state: State, states: Subgoal, key: Key[Array, ""]) -> tuple[State,
     state, metrics = jax.lax.scan(one, state, jax.random.split(key, state.config.vae_updates))
     means = {name: values.mean() for name, values in metrics.items()}
     return state, means | vae_errors(state, inputs[num_training:][:NUM_MEASURED])
+
+
+def reconstruct(state: State, states: Subgoal) -> Shaped[Array, "N ..."]:
+    """Return what is left of states after encoding and decoding."""
+    return state.vae.decode(state.vae.encode(encoders.as_vector(state.spec, states)).mean)
 
 
 def vae_errors(state: State, inputs: Shaped[Array, "N ..."]) -> Metrics:
@@ -272,10 +238,9 @@ def update_vae(
 ) -> tuple[State, Metrics]:
     """Return the state after one gradient step of the autoencoder."""
     noise = jax.random.normal(key, (len(states), state.config.latent_size))
-    gradient_of = eqx.filter_value_and_grad(vaes.loss, has_aux=True)
-    (_, metrics), gradient = gradient_of(state.vae, states, noise, state.config.vae_kl_weight)
-    vae, vae_optimizer = optimizer.step(
-        state.vae, gradient, state.vae_optimizer, state.config.vae_learning_rate
+    old, rate = (state.vae, state.vae_optimizer), state.config.vae_learning_rate
+    vae, vae_optimizer, metrics = optimizer.minimise(
+        vaes.loss, *old, rate, states, noise, state.config.vae_kl_weight
     )
     return replace(state, vae=vae, vae_optimizer=vae_optimizer), metrics
 
@@ -304,10 +269,10 @@ def act_on(
 
     Where ``explore``, the TDM aims at the goal itself, without a plan, as data are collected.
     """
-    start, goal = codes(state, observation), codes(state, goal)
     if explore:
-        actions, explorer = tdm.act_on(state, memory.explorer, start, goal, key, True)
+        actions, explorer = tdm.act_on(state, memory.explorer, observation, goal, key, True)
         return actions, memory._replace(explorer=explorer)
+    start, goal = state.encoder(observation), state.encoder(goal)
     memory = memory._replace(latents=plan_where_due(state, start, goal, memory, key))
     steps = segment_steps(state.config, state.spec)
     steps_left = (steps - 1 - memory.elapsed % steps)[:, None].astype(jnp.float32)
@@ -315,12 +280,18 @@ def act_on(
     return actions, memory._replace(elapsed=memory.elapsed + 1)
 
 
+def rest(memory: Memory, done: Bool[Any, " B"]) -> Memory:
+    """Return the memory with these episodes far beyond their last segment, where none plans."""
+    beyond = 2**30
+    return memory._replace(elapsed=jnp.where(done, beyond, memory.elapsed))
+
+
 def aims(state: State, memory: Memory, goal: Float[Array, "B G"]) -> Float[Array, "B G"]:
     """Return the current subgoals, or the goals in the last segment."""
     segment = memory.elapsed // segment_steps(state.config, state.spec)
     last = state.config.num_subgoals
     row = jnp.arange(len(segment))
-    subgoal = subgoal_codes(state, memory.latents[row, jnp.minimum(segment, last - 1)])
+    subgoal = subgoals_of(state, memory.latents[row, jnp.minimum(segment, last - 1)])
     return jnp.where(segment[:, None] >= last, goal, subgoal.achieved_goal)
 
 
@@ -344,7 +315,19 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     """
     vae_key, tdm_key = jax.random.split(key)
     vae = vaes.create(spec, config.latent_size, config.vae_hidden, vae_key)
-    coded = replace(spec, observation_shape=(config.latent_size,), goal_shape=(config.latent_size,))
-    model = tdm.create(config, coded if spec.is_image else spec, tdm_key)
+    model = tdm.create(config, spec.encoded(config.latent_size) if spec.is_image else spec, tdm_key)
     parts = {field.name: getattr(model, field.name) for field in dataclasses.fields(model)}
     return State(**{**parts, "spec": spec}, vae=vae, vae_optimizer=optimizer.init(vae))
+
+
+AGENT = Agent(
+    Config,
+    create,
+    tdm.update,
+    act,
+    networks=(*tdm.NETWORKS, "vae"),
+    value=tdm.AGENT.value,
+    memory=EpisodeMemory(begin, act_on, rest, planned),
+    pretrain=Pretrain(pretrain_settings, pretrain, reconstruct),
+    freezing=Freezing(lambda state: LatentMean(state.vae), at_start=True, kept=("vae",)),
+)

@@ -1,10 +1,11 @@
 """RIS: reinforcement learning with imagined subgoals (ICML 2021, appendices A and B).
 
-One update does, in this order: critics, subgoal policy, policy, Polyak copies. Each step uses the
+One update does, in this order: critics, subgoal policy, policy, target networks. Each step uses the
 networks that the step before has just updated.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -13,62 +14,44 @@ import optax
 from jaxtyping import Array, Float, Key, Shaped
 
 from midway import functional
+from midway.agent import Agent, Freezing, Inputs, SubgoalDistribution, Value
+from midway.agents import beyond
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
 from midway.networks.critics import TwinCritic
-from midway.networks.encoder import Encoder, StateEncoder
-from midway.networks.mlp import Precision
+from midway.networks.encoder import Encoder
+from midway.networks.mlp import PRECISIONS, Precision
 from midway.networks.policies import GaussianPolicy, SubgoalPolicy
+from midway.settings import check, setting
 from midway.types import Batch, EnvSpec, Metrics, Subgoal
 
 
 @dataclass(frozen=True)
-class Config:
-    """Hyperparameters of RIS; the defaults are table 1, ant navigation.
+class Config(beyond.SubgoalSettings):
+    """Hyperparameters of RIS; the defaults are table 1, ant navigation."""
 
-    Attributes:
-        hidden: Hidden layers of every network.
-        discount: γ.
-        target_update_rate: τ, of the target critics and the prior policy.
-        critic_learning_rate: Adam's rate for the critics.
-        policy_learning_rate: Adam's rate for the policy.
-        subgoal_learning_rate: Adam's rate for the subgoal policy.
-        encoder_learning_rate: Adam's rate for the image encoder (original code).
-        encoder_updates: Updates after which the encoder stays as it is and images are no longer
-            translated; 0 for never, as in the paper.
-        image_translation: Largest random translation of an image along each axis (pixels).
-        image_pooling: Side of the squares of pixels that the encoder averages first (ours).
-        kl_weight: α, the weight of the KL divergence to the prior.
-        advantage_temperature: λ, of the weights of subgoal candidates.
-        num_subgoals: I, subgoals imagined for the prior (eq. 18).
-        epsilon: ε inside the logarithm of the prior (eq. 18).
-        precision: Products in ``f32`` or ``bf16``; everything else is float32.
-    """
+    hidden: tuple[int, ...] = setting((256, 256), "table 1", "layers of every network", least=1)
+    discount: float = setting(0.99, "table 1", "γ", above=0, below=1)
+    target_update_rate: float = setting(0.005, "table 1", "τ", above=0, most=1)
+    critic_learning_rate: float = setting(1e-3, "table 1", "Adam, critics", above=0, most=1)
+    policy_learning_rate: float = setting(1e-3, "table 1", "Adam, policy", above=0, most=1)
+    subgoal_learning_rate: float = setting(1e-4, "table 1", "Adam, subgoals", above=0, most=1)
+    encoder_learning_rate: float = setting(1e-4, "original code", "Adam, images", above=0, most=1)
+    random_shift: int = setting(8, "appendix B", "of images, at most (pixels)", least=0)
+    image_pooling: int = setting(1, "not in the paper", "side of averaged squares", least=1)
+    kl_weight: float = setting(0.1, "table 1", "α, of D_KL to the prior", least=0)
+    advantage_temperature: float = setting(0.1, "table 1", "λ", above=0)
+    num_subgoals: int = setting(10, "appendix B", "I, imagined for the prior", least=1)
+    epsilon: float = setting(1e-16, "table 1", "ε, in the log of the prior", above=0, below=1)
+    precision: Precision = setting("f32", "original code", "of products", choices=PRECISIONS)
 
-    hidden: tuple[int, ...] = (256, 256)
-    discount: float = 0.99
-    target_update_rate: float = 0.005
-    critic_learning_rate: float = 1e-3
-    policy_learning_rate: float = 1e-3
-    subgoal_learning_rate: float = 1e-4
-    encoder_learning_rate: float = 1e-4
-    encoder_updates: int = 0
-    image_translation: int = 8
-    image_pooling: int = 1
-    kl_weight: float = 0.1
-    advantage_temperature: float = 0.1
-    num_subgoals: int = 10
-    epsilon: float = 1e-16
-    precision: Precision = "f32"
-
-    @property
-    def value_bound(self) -> float:
-        """The largest number of discounted steps, 1 / (1 - γ): values lie in [-bound, 0]."""
-        return 1 / (1 - self.discount)
+    def __post_init__(self) -> None:
+        """Check the values, or raise a ConfigurationError."""
+        check(self)
 
 
 class State(eqx.Module):
-    """Networks, their Polyak copies and their optimisers."""
+    """Networks, their target networks and their optimisers."""
 
     encoder: Encoder
     critic: TwinCritic
@@ -84,49 +67,21 @@ class State(eqx.Module):
     spec: EnvSpec = eqx.field(static=True)
 
 
-NETWORKS = ("encoder", "critic", "target_critic", "subgoal_policy", "policy", "prior_policy")
-"""The parts of the state that a saved policy holds."""
+# --- losses -------------------------------------------------------------------------------------
 
 
-# --- the two roles of a subgoal -------------------------------------------------------------------
-
-
-def as_subgoal(spec: EnvSpec, vector: Float[Array, "*B S"]) -> Subgoal:
-    """Split a predicted vector into the state it is started from and the goal it is reached as."""
-    if spec.goal_is_observation:
-        return Subgoal(vector, vector)
-    size = encoders.code_sizes(spec)[0]
-    return Subgoal(vector[..., :size], vector[..., size:])
-
-
-def as_vector(spec: EnvSpec, subgoal: Subgoal) -> Float[Array, "*B S"]:
-    """Join both roles of a subgoal into the vector that the subgoal policy predicts."""
-    if spec.goal_is_observation:
-        return subgoal.observation
-    return jnp.concatenate(subgoal, axis=-1)
-
-
-def subgoal_candidates(encoder: Encoder, batch: Batch, code: Float[Array, "B S"]) -> Subgoal:
-    """Return the codes of the states drawn from replay as candidates (eq. 17).
-
-    For images these are the codes of the batch's own observations, each beside another transition:
-    they are as uniform draws from replay as any, and need no further pass through the encoder.
-    """
-    if isinstance(encoder, StateEncoder):
-        return Subgoal(*map(encoder, batch.subgoal_candidate))
-    shifted = jnp.roll(code, 1, axis=0)
-    return Subgoal(shifted, shifted)
-
-
-# --- losses ---------------------------------------------------------------------------------------
+def as_subgoal(
+    state: State, observation: Float[Array, "*#B S"], predicted: Float[Array, "*B P"]
+) -> Subgoal:
+    """Return the subgoals that the subgoal policy's numbers stand for, in both of their roles."""
+    return encoders.as_subgoal(state.spec, state.policy.inputs.embed(observation, predicted))
 
 
 def critic_target(state: State, batch: Batch, noise: Float[Array, "B A"]) -> Float[Array, " B"]:
     """Return r + γ (1 - terminated) min Q'(s', a', g), a' ~ π_θ; there is no entropy term."""
     next_action = jnp.tanh(state.policy(batch.next_observation, batch.goal).sample(noise))
     next_q = state.target_critic(batch.next_observation, next_action, batch.goal)
-    terminated = batch.terminated.astype(jnp.float32)
-    return functional.td_target(batch.reward, terminated, next_q.min(0), state.config.discount)
+    return beyond.n_step_target(batch, next_q.min(0), state.config)
 
 
 def critic_loss(
@@ -135,15 +90,13 @@ def critic_loss(
     batch: Batch,
     target: Float[Array, " B"],
 ) -> tuple[Float[Array, ""], tuple[Float[Array, "B S"], Metrics]]:
-    """Return the loss of the critics, and the codes of the current observations.
-
-    Only the current observation is encoded with gradient; the batch holds fixed codes.
-    """
+    """Return the loss of the critics, and the features of the current observations."""
     critic, encoder = networks
-    code = encoder(observation)
-    q = critic(code, batch.action, batch.goal)
+    features = encoder(observation)
+    q = critic(features, batch.action, batch.goal)
     loss = functional.critic_loss(q, target)
-    return loss, (code, {"critic/loss": loss, "critic/q": q.mean(), "critic/target": target.mean()})
+    metrics = {"critic/loss": loss, "critic/q": q.mean(), "critic/target": target.mean()}
+    return loss, (features, metrics)
 
 
 def value(
@@ -154,29 +107,35 @@ def value(
     return state.critic(observation, action, goal).min(0)
 
 
+def subgoal_cost(state: State, batch: Batch, subgoal: Subgoal) -> Float[Array, " B"]:
+    """Return max(|V(s, s_g)|, |V(s_g, g)|) of one subgoal for each pair."""
+    return functional.subgoal_cost(
+        value(state, batch.observation, subgoal.achieved_goal),
+        value(state, subgoal.observation, batch.goal),
+        functional.value_bound(state.config.discount),
+    )
+
+
 def subgoal_advantage(
     state: State, batch: Batch, mean_subgoal: Float[Array, "B S"]
 ) -> Float[Array, " B"]:
     """Return the cost of the current mean subgoal minus the cost of the candidate."""
-
-    def cost(subgoal: Subgoal) -> Float[Array, " B"]:
-        return functional.subgoal_cost(
-            value(state, batch.observation, subgoal.achieved_goal),
-            value(state, subgoal.observation, batch.goal),
-            state.config.value_bound,
-        )
-
-    return cost(as_subgoal(state.spec, mean_subgoal)) - cost(batch.subgoal_candidate)
+    mean = as_subgoal(state, batch.observation, mean_subgoal)
+    return subgoal_cost(state, batch, mean) - subgoal_cost(state, batch, batch.subgoal_candidate)
 
 
 def subgoal_loss(
     subgoal_policy: SubgoalPolicy, state: State, batch: Batch
 ) -> tuple[Float[Array, ""], Metrics]:
     """Return the weighted negative log-likelihood of the candidates (eq. 17)."""
+    if state.config.candidates_per_pair > 1:
+        cost_of = partial(subgoal_cost, state)
+        return beyond.candidate_loss(subgoal_policy, cost_of, batch, state.spec, state.config)
     subgoals = subgoal_policy(batch.observation, batch.goal)
     advantage = jax.lax.stop_gradient(subgoal_advantage(state, batch, subgoals.location))
     weight = functional.advantage_weights(advantage, state.config.advantage_temperature)
-    candidate = as_vector(state.spec, batch.subgoal_candidate)
+    candidate = encoders.as_vector(state.spec, batch.subgoal_candidate)
+    candidate = subgoal_policy.inputs.pick(candidate)
     loss = functional.subgoal_loss(subgoals.log_density(candidate), weight)
     return loss, {
         "subgoal/loss": loss,
@@ -220,73 +179,65 @@ def policy_loss(
 def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
     """Return the state after one gradient step of every network, and scalars to log."""
     encoding_key, target_key, subgoal_key, action_key = jax.random.split(key, 4)
-    done = optimizer.updates(state.critic_optimizer)
-    learns = encoders.learns(state.encoder, state.config, batch.observation, done)
-    observation, batch = encoders.encode_fixed(state.encoder, batch, learns, encoding_key)
-    state, code, critic_metrics = update_critic(state, observation, batch, target_key)
+    config, done = state.config, optimizer.updates(state.critic_optimizer)
+    observation, batch = encoders.encode_batch(state.encoder, batch, encoding_key)
+    state, features, critic_metrics = update_critic(state, observation, batch, target_key)
     batch = batch._replace(
-        observation=code, subgoal_candidate=subgoal_candidates(state.encoder, batch, code)
+        observation=features,
+        subgoal_candidate=encoders.candidates(state.encoder, batch, features),
+        between=None if batch.between is None else state.encoder(batch.between),
     )
-    state, subgoal_metrics = update_subgoal_policy(state, batch)
-    state, policy_metrics = update_policy(state, batch, subgoal_key, action_key)
-    return update_copies(state), critic_metrics | subgoal_metrics | policy_metrics
+    due = partial(beyond.every, done)
+    state, subgoal_metrics = due(config.subgoal_every, update_subgoal_policy, state, batch)
+    keys = (subgoal_key, action_key)
+    state, policy_metrics = due(config.policy_every, update_policy, state, batch, *keys)
+    return update_targets(state), critic_metrics | subgoal_metrics | policy_metrics
 
 
 def update_critic(
     state: State, observation: Shaped[Array, "B ..."], batch: Batch, key: Key[Array, ""]
 ) -> tuple[State, Float[Array, "B S"], Metrics]:
-    """Step the critics and the encoder; also return the codes of the current observations."""
+    """Step the critics and the encoder; also return the features of the current observations."""
     target = critic_target(state, batch, jax.random.normal(key, batch.action.shape))
-    done = optimizer.updates(state.critic_optimizer)
-    learns = encoders.learns(state.encoder, state.config, observation, done)
-    state, (code, metrics) = optimizer.step_critic_and_encoder(
-        critic_loss, state, learns, observation, batch, target
+    state, (features, metrics) = optimizer.step_critic_and_encoder(
+        critic_loss, state, observation, batch, target
     )
-    return state, jax.lax.stop_gradient(code), metrics
+    return state, jax.lax.stop_gradient(features), metrics
 
 
 def update_subgoal_policy(state: State, batch: Batch) -> tuple[State, Metrics]:
     """Step the subgoal policy towards good candidates."""
-    gradient_of = eqx.filter_value_and_grad(subgoal_loss, has_aux=True)
-    (_, metrics), gradient = gradient_of(state.subgoal_policy, state, batch)
-    network, optimizer_state = optimizer.step(
-        state.subgoal_policy, gradient, state.subgoal_optimizer, state.config.subgoal_learning_rate
-    )
-    return replace(state, subgoal_policy=network, subgoal_optimizer=optimizer_state), metrics
+    old, rate = (state.subgoal_policy, state.subgoal_optimizer), state.config.subgoal_learning_rate
+    network, adam, metrics = optimizer.minimise(subgoal_loss, *old, rate, state, batch)
+    return replace(state, subgoal_policy=network, subgoal_optimizer=adam), metrics
 
 
 def update_policy(
     state: State, batch: Batch, subgoal_key: Key[Array, ""], action_key: Key[Array, ""]
 ) -> tuple[State, Metrics]:
     """Step the policy against the value and the prior of imagined subgoals."""
-    imagined = imagine(state, batch.observation, batch.goal, subgoal_key)
+    imagined = imagine(state, batch, subgoal_key).achieved_goal
     noise = jax.random.normal(action_key, batch.action.shape)
-    gradient_of = eqx.filter_value_and_grad(policy_loss, has_aux=True)
-    (_, metrics), gradient = gradient_of(state.policy, state, batch, noise, imagined.achieved_goal)
-    network, optimizer_state = optimizer.step(
-        state.policy, gradient, state.policy_optimizer, state.config.policy_learning_rate
-    )
-    return replace(state, policy=network, policy_optimizer=optimizer_state), metrics
+    old, rate = (state.policy, state.policy_optimizer), state.config.policy_learning_rate
+    inputs = (state, batch, noise, imagined)
+    network, adam, metrics = optimizer.minimise(policy_loss, *old, rate, *inputs)
+    return replace(state, policy=network, policy_optimizer=adam), metrics
 
 
-def imagine(
-    state: State,
-    observation: Float[Array, "B S"],
-    goal: Float[Array, "B G"],
-    key: Key[Array, ""],
-) -> Subgoal:
+def imagine(state: State, batch: Batch, key: Key[Array, ""]) -> Subgoal:
     """Return I subgoals s_g^i ~ π^H_ψ(· | s, g) for each pair, ``(B, I, S)``, without gradient."""
-    subgoals = state.subgoal_policy(observation, goal).sample(key, state.config.num_subgoals)
-    return as_subgoal(state.spec, jax.lax.stop_gradient(subgoals))
+    subgoals = state.subgoal_policy(batch.observation, batch.goal)
+    drawn = jax.lax.stop_gradient(subgoals.sample(key, state.config.num_subgoals))
+    return as_subgoal(state, batch.observation[:, None], drawn)
 
 
-def update_copies(state: State) -> State:
+def update_targets(state: State) -> State:
     """Move the target critics and the prior policy by τ (appendix B)."""
     rate = state.config.target_update_rate
     return replace(
         state,
-        target_critic=functional.polyak_update(state.critic, state.target_critic, rate),
-        prior_policy=functional.polyak_update(state.policy, state.prior_policy, rate),
+        target_critic=functional.target_update(state.critic, state.target_critic, rate),
+        prior_policy=functional.target_update(state.policy, state.prior_policy, rate),
     )
 
 
@@ -294,31 +245,33 @@ def update_copies(state: State) -> State:
 
 
 def act(
-    state: State,
-    observation: Shaped[Array, "B ..."],
-    goal: Shaped[Array, "B ..."],
-    key: Key[Array, ""],
-    explore: bool,
+    state: State, observation: Inputs, goal: Inputs, key: Key[Array, ""], explore: bool
 ) -> Float[Array, "B A"]:
     """Return actions in [-1, 1] of the flat policy: sampled where ``explore``, else the mean's."""
-    actions = state.policy(state.encoder(observation), state.encoder(goal))
-    if not explore:
-        return jnp.tanh(actions.mean)
-    return jnp.tanh(actions.sample(jax.random.normal(key, actions.mean.shape)))
+    return state.policy(state.encoder(observation), state.encoder(goal)).act(key, explore)
+
+
+def subgoal_distribution(state: State, observation: Inputs, goal: Inputs) -> SubgoalDistribution:
+    """Return π^H_ψ(· | s, g) in the environment's units, one Laplace for each pair."""
+    features = state.encoder(observation)
+    subgoals = state.subgoal_policy(features, state.encoder(goal))
+    location = as_subgoal(state, features, subgoals.location)
+    scale = state.subgoal_policy.inputs.spread(features, jnp.exp(subgoals.log_scale))
+    return SubgoalDistribution(
+        Subgoal(*map(state.encoder.states, location)),
+        Subgoal(*map(state.encoder.spread, encoders.as_subgoal(state.spec, scale))),
+    )
 
 
 def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
-    """Return networks at their random start; the copies equal their originals."""
+    """Return networks at their random start; the target networks equal the online ones."""
     encoder_key, critic_key, subgoal_key, policy_key = jax.random.split(key, 4)
-    observation_size, goal_size = encoders.code_sizes(spec)
-    subgoal_size = observation_size if spec.goal_is_observation else observation_size + goal_size
-    pair = observation_size + goal_size
-    encoder = encoders.create(spec, config, encoder_key)
-    critic = TwinCritic(pair + spec.action_dim, config.hidden, config.precision, key=critic_key)
-    subgoal_policy = SubgoalPolicy(
-        pair, subgoal_size, config.hidden, config.precision, key=subgoal_key
-    )
-    policy = GaussianPolicy(pair, spec.action_dim, config.hidden, config.precision, key=policy_key)
+    keys = (encoder_key, critic_key, policy_key)
+    encoder, critic, policy = beyond.actor_critic(config, spec, keys)
+    read = policy.inputs
+    sizes = beyond.pair_size(spec, read), len(read.coordinates) or encoders.subgoal_size(spec)
+    layers = (config.hidden, config.precision)
+    subgoal_policy = SubgoalPolicy(*sizes, *layers, key=subgoal_key, inputs=read)
     return State(
         encoder=encoder,
         critic=critic,
@@ -333,3 +286,16 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
         config=config,
         spec=spec,
     )
+
+
+AGENT = Agent(
+    Config,
+    create,
+    update,
+    act,
+    networks=("encoder", "critic", "target_critic", "subgoal_policy", "policy", "prior_policy"),
+    value=Value(encoders.on_observations(value), "value: minus discounted steps to the goal"),
+    subgoals=subgoal_distribution,
+    sampling=beyond.subgoal_sampling,
+    freezing=Freezing(lambda state: state.encoder),
+)

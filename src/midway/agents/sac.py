@@ -2,7 +2,7 @@
 
 Haarnoja et al., "Soft actor-critic algorithms and applications" (2018), with goals as inputs; the
 target entropy is -dim(A) (appendix D). One update does, in this order: critics, policy, entropy
-coefficient, Polyak copies. Each step uses the networks that the step before has just updated.
+coefficient, target networks. Each step uses the networks that the step before has just updated.
 """
 
 from dataclasses import dataclass, replace
@@ -14,45 +14,36 @@ import optax
 from jaxtyping import Array, Float, Key, Shaped
 
 from midway import functional
+from midway.agent import Agent, Freezing, Value
+from midway.agents import beyond
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
 from midway.networks.critics import TwinCritic
 from midway.networks.encoder import Encoder
-from midway.networks.mlp import Precision
-from midway.networks.policies import Gaussian, GaussianPolicy
+from midway.networks.mlp import PRECISIONS, Precision
+from midway.networks.policies import GaussianPolicy
+from midway.settings import check, setting
 from midway.types import Batch, EnvSpec, Metrics
 
 
 @dataclass(frozen=True)
-class Config:
-    """Hyperparameters of SAC; the defaults are table 1, ant navigation.
+class Config(beyond.Settings):
+    """Hyperparameters of SAC; the defaults are table 1, ant navigation."""
 
-    Attributes:
-        hidden: Hidden layers of every network.
-        discount: γ.
-        target_update_rate: τ, of the target critics.
-        critic_learning_rate: Adam's rate for the critics.
-        policy_learning_rate: Adam's rate for the policy.
-        entropy_learning_rate: Adam's rate for the logarithm of the entropy coefficient.
-        encoder_learning_rate: Adam's rate for the image encoder.
-        encoder_updates: Updates after which the encoder stays as it is and images are no longer
-            translated; 0 for never, as in the paper.
-        image_translation: Largest random translation of an image along each axis (pixels).
-        image_pooling: Side of the squares of pixels that the encoder averages first (ours).
-        precision: Products in ``f32`` or ``bf16``; everything else is float32.
-    """
+    hidden: tuple[int, ...] = setting((256, 256), "table 1", "layers of every network", least=1)
+    discount: float = setting(0.99, "table 1", "γ", above=0, below=1)
+    target_update_rate: float = setting(0.005, "table 1", "τ", above=0, most=1)
+    critic_learning_rate: float = setting(1e-3, "table 1", "Adam, critics", above=0, most=1)
+    policy_learning_rate: float = setting(1e-3, "table 1", "Adam, policy", above=0, most=1)
+    entropy_learning_rate: float = setting(1e-3, "the policy's", "Adam, log c", above=0, most=1)
+    encoder_learning_rate: float = setting(1e-4, "code of RIS", "Adam, images", above=0, most=1)
+    random_shift: int = setting(8, "appendix B", "of images, at most (pixels)", least=0)
+    image_pooling: int = setting(1, "not in the paper", "side of averaged squares", least=1)
+    precision: Precision = setting("f32", "code of RIS", "of products", choices=PRECISIONS)
 
-    hidden: tuple[int, ...] = (256, 256)
-    discount: float = 0.99
-    target_update_rate: float = 0.005
-    critic_learning_rate: float = 1e-3
-    policy_learning_rate: float = 1e-3
-    entropy_learning_rate: float = 1e-3
-    encoder_learning_rate: float = 1e-4
-    encoder_updates: int = 0
-    image_translation: int = 8
-    image_pooling: int = 1
-    precision: Precision = "f32"
+    def __post_init__(self) -> None:
+        """Check the values, or raise a ConfigurationError."""
+        check(self)
 
 
 class State(eqx.Module):
@@ -71,29 +62,15 @@ class State(eqx.Module):
     spec: EnvSpec = eqx.field(static=True)
 
 
-NETWORKS = ("encoder", "critic", "target_critic", "policy")
-"""The parts of the state that a saved policy holds."""
-
-
 # --- losses ---------------------------------------------------------------------------------------
-
-
-def sample(
-    actions: Gaussian, noise: Float[Array, "B A"]
-) -> tuple[Float[Array, "B A"], Float[Array, " B"]]:
-    """Return tanh-squashed actions and their log-densities log π_θ(a | s, g)."""
-    pre_tanh = actions.sample(noise)
-    log_density = actions.log_density(pre_tanh) - functional.tanh_log_determinant(pre_tanh)
-    return jnp.tanh(pre_tanh), log_density
 
 
 def critic_target(state: State, batch: Batch, noise: Float[Array, "B A"]) -> Float[Array, " B"]:
     """Return r + γ (1 - terminated) (min Q'(s', a', g) - c log π(a' | s', g)), a' ~ π_θ."""
-    next_action, log_density = sample(state.policy(batch.next_observation, batch.goal), noise)
+    next_action, log_density = state.policy(batch.next_observation, batch.goal).squashed(noise)
     next_q = state.target_critic(batch.next_observation, next_action, batch.goal).min(0)
     next_value = next_q - jnp.exp(state.log_entropy_coefficient) * log_density
-    terminated = batch.terminated.astype(jnp.float32)
-    return functional.td_target(batch.reward, terminated, next_value, state.config.discount)
+    return beyond.n_step_target(batch, next_value, state.config)
 
 
 def critic_loss(
@@ -102,19 +79,20 @@ def critic_loss(
     batch: Batch,
     target: Float[Array, " B"],
 ) -> tuple[Float[Array, ""], tuple[Float[Array, "B S"], Metrics]]:
-    """Return the loss of the critics, and the codes of the current observations."""
+    """Return the loss of the critics, and the features of the current observations."""
     critic, encoder = networks
-    code = encoder(observation)
-    q = critic(code, batch.action, batch.goal)
+    features = encoder(observation)
+    q = critic(features, batch.action, batch.goal)
     loss = functional.critic_loss(q, target)
-    return loss, (code, {"critic/loss": loss, "critic/q": q.mean(), "critic/target": target.mean()})
+    metrics = {"critic/loss": loss, "critic/q": q.mean(), "critic/target": target.mean()}
+    return loss, (features, metrics)
 
 
 def policy_loss(
     policy: GaussianPolicy, state: State, batch: Batch, noise: Float[Array, "B A"]
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Metrics]]:
     """Return the mean of c log π_θ(a | s, g) - min Q, and the entropy estimate."""
-    action, log_density = sample(policy(batch.observation, batch.goal), noise)
+    action, log_density = policy(batch.observation, batch.goal).squashed(noise)
     q = state.critic(batch.observation, action, batch.goal).min(0)
     loss = (jnp.exp(state.log_entropy_coefficient) * log_density - q).mean()
     entropy = -log_density.mean()
@@ -128,6 +106,14 @@ def entropy_loss(
     return log_entropy_coefficient * (jax.lax.stop_gradient(entropy) - target)
 
 
+def value(
+    state: State, observation: Float[Array, "B S"], goal: Float[Array, "B G"]
+) -> Float[Array, " B"]:
+    """Return V(s, g): the smaller Q at the tanh of the policy's mean action, without entropy."""
+    action = jnp.tanh(state.policy(observation, goal).mean)
+    return state.critic(observation, action, goal).min(0)
+
+
 # --- update ---------------------------------------------------------------------------------------
 
 
@@ -135,11 +121,12 @@ def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metr
     """Return the state after one gradient step of every network, and scalars to log."""
     encoding_key, target_key, action_key = jax.random.split(key, 3)
     done = optimizer.updates(state.critic_optimizer)
-    learns = encoders.learns(state.encoder, state.config, batch.observation, done)
-    observation, batch = encoders.encode_fixed(state.encoder, batch, learns, encoding_key)
-    state, code, critic_metrics = update_critic(state, observation, batch, target_key)
-    state, policy_metrics = update_policy(state, batch._replace(observation=code), action_key)
-    target_critic = functional.polyak_update(
+    observation, batch = encoders.encode_batch(state.encoder, batch, encoding_key)
+    state, features, critic_metrics = update_critic(state, observation, batch, target_key)
+    batch = batch._replace(observation=features)
+    count = state.config.policy_every
+    state, policy_metrics = beyond.every(done, count, update_policy, state, batch, action_key)
+    target_critic = functional.target_update(
         state.critic, state.target_critic, state.config.target_update_rate
     )
     return replace(state, target_critic=target_critic), critic_metrics | policy_metrics
@@ -148,23 +135,20 @@ def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metr
 def update_critic(
     state: State, observation: Shaped[Array, "B ..."], batch: Batch, key: Key[Array, ""]
 ) -> tuple[State, Float[Array, "B S"], Metrics]:
-    """Step the critics and the encoder; also return the codes of the current observations."""
+    """Step the critics and the encoder; also return the features of the current observations."""
     target = critic_target(state, batch, jax.random.normal(key, batch.action.shape))
-    done = optimizer.updates(state.critic_optimizer)
-    learns = encoders.learns(state.encoder, state.config, observation, done)
-    state, (code, metrics) = optimizer.step_critic_and_encoder(
-        critic_loss, state, learns, observation, batch, target
+    state, (features, metrics) = optimizer.step_critic_and_encoder(
+        critic_loss, state, observation, batch, target
     )
-    return state, jax.lax.stop_gradient(code), metrics
+    return state, jax.lax.stop_gradient(features), metrics
 
 
 def update_policy(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
     """Step the policy, then the entropy coefficient towards the target entropy -dim(A)."""
     noise = jax.random.normal(key, batch.action.shape)
-    gradient_of = eqx.filter_value_and_grad(policy_loss, has_aux=True)
-    (_, (entropy, metrics)), gradient = gradient_of(state.policy, state, batch, noise)
-    policy, policy_optimizer = optimizer.step(
-        state.policy, gradient, state.policy_optimizer, state.config.policy_learning_rate
+    old, rate = (state.policy, state.policy_optimizer), state.config.policy_learning_rate
+    policy, policy_optimizer, (entropy, metrics) = optimizer.minimise(
+        policy_loss, *old, rate, state, batch, noise
     )
     entropy_gradient = jax.grad(entropy_loss)(
         state.log_entropy_coefficient, entropy, -float(state.spec.action_dim)
@@ -196,19 +180,14 @@ def act(
     explore: bool,
 ) -> Float[Array, "B A"]:
     """Return actions in [-1, 1]: sampled where ``explore``, else the tanh of the mean."""
-    actions = state.policy(state.encoder(observation), state.encoder(goal))
-    if not explore:
-        return jnp.tanh(actions.mean)
-    return jnp.tanh(actions.sample(jax.random.normal(key, actions.mean.shape)))
+    return state.policy(state.encoder(observation), state.encoder(goal)).act(key, explore)
 
 
 def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     """Return networks at their random start; the target critics equal the critics."""
     encoder_key, critic_key, policy_key = jax.random.split(key, 3)
-    pair = sum(encoders.code_sizes(spec))
-    encoder = encoders.create(spec, config, encoder_key)
-    critic = TwinCritic(pair + spec.action_dim, config.hidden, config.precision, key=critic_key)
-    policy = GaussianPolicy(pair, spec.action_dim, config.hidden, config.precision, key=policy_key)
+    keys = (encoder_key, critic_key, policy_key)
+    encoder, critic, policy = beyond.actor_critic(config, spec, keys)
     log_entropy_coefficient = jnp.zeros(())
     return State(
         encoder=encoder,
@@ -223,3 +202,15 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
         config=config,
         spec=spec,
     )
+
+
+AGENT = Agent(
+    Config,
+    create,
+    update,
+    act,
+    networks=("encoder", "critic", "target_critic", "policy"),
+    value=Value(encoders.on_observations(value), "value: minus discounted steps to the goal"),
+    sampling=beyond.sampling,
+    freezing=Freezing(lambda state: state.encoder),
+)

@@ -3,7 +3,7 @@
 Pong et al. (2018), as LEAP trains them (Nasiriany et al. 2019; appendix D and table 2). Q(s, a, g,
 n) predicts how far from the goal each number of the state will be when n steps are left after this
 one: a vector, minus the absolute differences. One update does, in this order: critics, and every
-second time policy and Polyak copies. Each step uses the networks that the one before has updated.
+second time policy and target networks. Each step uses the networks that the one before has updated.
 """
 
 from dataclasses import dataclass, replace
@@ -16,11 +16,13 @@ import optax
 from jaxtyping import Array, Float, Int, Key, Shaped
 
 from midway import functional
+from midway.agent import Agent, EpisodeMemory, Freezing, Value
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
 from midway.networks.encoder import Encoder
 from midway.networks.initialization import with_small_output
-from midway.networks.mlp import MLP, Precision
+from midway.networks.mlp import MLP, PRECISIONS, Precision
+from midway.settings import check, setting
 from midway.types import Batch, ConfigurationError, EnvSpec, Metrics
 
 OUTPUT_BOUND = 3e-3
@@ -29,55 +31,35 @@ OUTPUT_BOUND = 3e-3
 
 @dataclass(frozen=True)
 class Config:
-    """Hyperparameters of TDM; the defaults are those of the ant (appendix D, original code).
+    """Hyperparameters of TDM; the defaults are those of the ant (appendix D, code of LEAP)."""
 
-    Attributes:
-        hidden: Hidden layers of every network.
-        max_steps_left: The horizon: steps_left is drawn from 0 to this, included (table 2).
-        num_rewards: Length of the reward vector, the first numbers of what success is measured on
-            (positions, not velocities); 0: all.
-        reward_scale: Factor of the reward.
-        target_update_rate: τ, of the target networks.
-        policy_delay: Updates of the critics for each update of policy and target networks.
-        critic_learning_rate: Adam's rate for the critics.
-        policy_learning_rate: Adam's rate for the policy.
-        encoder_learning_rate: Adam's rate for the image encoder.
-        encoder_updates: Updates after which the encoder stays as it is and images are no longer
-            translated; 0 for never, as in the paper.
-        image_translation: Largest random translation of an image along each axis (pixels).
-        image_pooling: Side of the squares of pixels that the encoder averages first (ours).
-        target_noise: Standard deviation of the noise on target actions.
-        target_noise_bound: Bound of that noise.
-        saturation_weight: Weight of the cost of actions far in the tails of tanh.
-        saturation_bound: Absolute value before the tanh from which that cost is positive.
-        exploration_noise: Standard deviation of the steps of the Ornstein-Uhlenbeck process.
-        exploration_reversion: Share of that process's value that is lost in each step.
-        precision: Products in ``f32`` or ``bf16``; everything else is float32.
-    """
+    hidden: tuple[int, ...] = setting((400, 300), "appendix D", "layers of every network", least=1)
+    max_steps_left: int = setting(50, "table 2", "the horizon", least=0)
+    num_rewards: int = setting(0, "not in the paper", "length of the reward; 0: all", least=0)
+    reward_scale: float = setting(10.0, "code of LEAP", "factor of the reward", above=0)
+    target_update_rate: float = setting(0.005, "code of LEAP", "τ", above=0, most=1)
+    policy_delay: int = setting(2, "code of LEAP", "critic updates for each of policy", least=1)
+    critic_learning_rate: float = setting(1e-3, "code of LEAP", "Adam, critics", above=0, most=1)
+    policy_learning_rate: float = setting(1e-3, "code of LEAP", "Adam, policy", above=0, most=1)
+    encoder_learning_rate: float = setting(1e-4, "code of RIS", "Adam, images", above=0, most=1)
+    random_shift: int = setting(8, "appendix B", "of images, at most (pixels)", least=0)
+    normalise: bool = setting(False, "none", "states by the environment's center and spread")
+    image_pooling: int = setting(1, "not in the paper", "side of averaged squares", least=1)
+    target_noise: float = setting(0.2, "code of LEAP", "deviation, on target actions", least=0)
+    target_noise_bound: float = setting(0.5, "code of LEAP", "bound of that noise", least=0)
+    saturation_weight: float = setting(1.0, "code of LEAP", "of actions in tanh's tails", least=0)
+    saturation_bound: float = setting(20.0, "code of LEAP", "pre-tanh, free of cost", least=0)
+    exploration_noise: float = setting(0.3, "code of LEAP", "σ, Ornstein-Uhlenbeck", least=0)
+    exploration_reversion: float = setting(0.15, "code of LEAP", "θ of that", least=0, most=1)
+    precision: Precision = setting("f32", "code of LEAP", "of products", choices=PRECISIONS)
 
-    hidden: tuple[int, ...] = (400, 300)
-    max_steps_left: int = 50
-    num_rewards: int = 0
-    reward_scale: float = 10.0
-    target_update_rate: float = 0.005
-    policy_delay: int = 2
-    critic_learning_rate: float = 1e-3
-    policy_learning_rate: float = 1e-3
-    encoder_learning_rate: float = 1e-4
-    encoder_updates: int = 0
-    image_translation: int = 8
-    image_pooling: int = 1
-    target_noise: float = 0.2
-    target_noise_bound: float = 0.5
-    saturation_weight: float = 1.0
-    saturation_bound: float = 20.0
-    exploration_noise: float = 0.3
-    exploration_reversion: float = 0.15
-    precision: Precision = "f32"
+    def __post_init__(self) -> None:
+        """Check the values, or raise a ConfigurationError."""
+        check(self)
 
 
 class State(eqx.Module):
-    """Networks, their Polyak copies, their optimisers and the number of updates."""
+    """Networks, their target networks, their optimisers and the number of updates."""
 
     encoder: Encoder
     critic: tuple[MLP, MLP]
@@ -93,9 +75,6 @@ class State(eqx.Module):
 
 
 AnyState = TypeVar("AnyState", bound=State)
-
-NETWORKS = ("encoder", "critic", "target_critic", "policy", "target_policy")
-"""The parts of the state that a saved policy holds."""
 
 
 class Memory(NamedTuple):
@@ -151,12 +130,13 @@ def critic_loss(
     steps_left: Float[Array, "B 1"],
     target: Float[Array, "B R"],
 ) -> tuple[Float[Array, ""], tuple[Float[Array, "B S"], Metrics]]:
-    """Return both critics' mean squared errors, and the codes of the current observations."""
+    """Return both critics' mean squared errors, and the features of the current observations."""
     critic, encoder = networks
-    code = encoder(observation)
-    q = q_values(critic, code, batch.action, batch.goal, steps_left)
+    features = encoder(observation)
+    q = q_values(critic, features, batch.action, batch.goal, steps_left)
     loss = ((q - target) ** 2).mean((1, 2)).sum()
-    return loss, (code, {"critic/loss": loss, "critic/q": q.mean(), "critic/target": target.mean()})
+    metrics = {"critic/loss": loss, "critic/q": q.mean(), "critic/target": target.mean()}
+    return loss, (features, metrics)
 
 
 def policy_loss(
@@ -199,19 +179,17 @@ def update(state: AnyState, batch: Batch, key: Key[Array, ""]) -> tuple[AnyState
     """
     encoding_key, steps_key, noise_key = jax.random.split(key, 3)
     reward = reward_vector(state.config, batch)
-    done = optimizer.updates(state.critic_optimizer)
-    learns = encoders.learns(state.encoder, state.config, batch.observation, done)
-    observation, batch = encoders.encode_fixed(state.encoder, batch, learns, encoding_key)
+    observation, batch = encoders.encode_batch(state.encoder, batch, encoding_key)
     steps_left = draw_steps_left(state.config, len(batch.action), steps_key)
     noise = jax.random.normal(noise_key, batch.action.shape)
     target = critic_target(state, batch, reward, steps_left, noise)
-    state, code, metrics = update_critic(state, observation, batch, steps_left, target)
+    state, features, metrics = update_critic(state, observation, batch, steps_left, target)
     nothing = {"policy/loss": jnp.zeros(()), "policy/saturation": jnp.zeros(())}
     state, policy_metrics = jax.lax.cond(
         state.updates % state.config.policy_delay == 0,
-        update_policy_and_copies,
+        update_policy_and_targets,
         lambda state, *_: (state, nothing),
-        *(state, batch._replace(observation=code), steps_left),
+        *(state, batch._replace(observation=features), steps_left),
     )
     return replace(state, updates=state.updates + 1), metrics | policy_metrics
 
@@ -228,31 +206,28 @@ def update_critic(
     steps_left: Float[Array, "B 1"],
     target: Float[Array, "B R"],
 ) -> tuple[AnyState, Float[Array, "B S"], Metrics]:
-    """Step the critics and the encoder; also return the codes of the current observations."""
-    done = optimizer.updates(state.critic_optimizer)
-    learns = encoders.learns(state.encoder, state.config, observation, done)
-    state, (code, metrics) = optimizer.step_critic_and_encoder(
-        critic_loss, state, learns, observation, batch, steps_left, target
+    """Step the critics and the encoder; also return the features of the current observations."""
+    state, (features, metrics) = optimizer.step_critic_and_encoder(
+        critic_loss, state, observation, batch, steps_left, target
     )
-    return state, jax.lax.stop_gradient(code), metrics
+    return state, jax.lax.stop_gradient(features), metrics
 
 
-def update_policy_and_copies(
+def update_policy_and_targets(
     state: AnyState, batch: Batch, steps_left: Float[Array, "B 1"]
 ) -> tuple[AnyState, Metrics]:
     """Step the policy against critic 1 and move all target networks by τ."""
-    gradient_of = eqx.filter_value_and_grad(policy_loss, has_aux=True)
-    (_, metrics), gradient = gradient_of(state.policy, state, batch, steps_left)
-    policy, policy_optimizer = optimizer.step(
-        state.policy, gradient, state.policy_optimizer, state.config.policy_learning_rate
+    old, rate = (state.policy, state.policy_optimizer), state.config.policy_learning_rate
+    policy, policy_optimizer, metrics = optimizer.minimise(
+        policy_loss, *old, rate, state, batch, steps_left
     )
     rate = state.config.target_update_rate
     state = replace(
         state,
         policy=policy,
         policy_optimizer=policy_optimizer,
-        target_policy=functional.polyak_update(policy, state.target_policy, rate),
-        target_critic=functional.polyak_update(state.critic, state.target_critic, rate),
+        target_policy=functional.target_update(policy, state.target_policy, rate),
+        target_critic=functional.target_update(state.critic, state.target_critic, rate),
     )
     return state, {name: state.config.policy_delay * value for name, value in metrics.items()}
 
@@ -302,16 +277,16 @@ def act(
 
 
 def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
-    """Return networks at their random start; the copies equal their originals.
+    """Return networks at their random start; the target networks equal the online ones.
 
     Raises:
         ConfigurationError: The goals are images and there is no true state to take rewards from.
     """
-    if spec.is_image and spec.state_shape is None:
+    if (spec.is_image or spec.image_shape) and spec.state_shape is None:
         raise ConfigurationError(f"{spec.name}: rewards of tdm need goals or states of numbers")
     encoder_key, first_key, second_key, policy_key = jax.random.split(key, 4)
     num_rewards = config.num_rewards or (spec.state_shape or spec.goal_shape)[0]
-    inputs = sum(encoders.code_sizes(spec)) + 1
+    inputs = sum(encoders.feature_sizes(spec)) + 1
 
     def network(in_size: int, out_size: int, key: Key[Array, ""]) -> MLP:
         new = MLP(in_size, config.hidden, out_size, config.precision, key=key)
@@ -335,3 +310,17 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
         config=config,
         spec=spec,
     )
+
+
+NETWORKS = ("encoder", "critic", "target_critic", "policy", "target_policy")
+
+AGENT = Agent(
+    Config,
+    create,
+    update,
+    act,
+    networks=NETWORKS,
+    value=Value(encoders.on_observations(value), "value: minus distance left at the horizon"),
+    memory=EpisodeMemory(begin, act_on),
+    freezing=Freezing(lambda state: state.encoder),
+)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from midway.cli.parsing import Count, OptionalCount, parse, settings
+from midway.cli.parsing import Count, OptionalCount, parse, plain, settings
 from midway.types import ConfigurationError, NonFiniteError
 
 EXIT_FAILED = 1
@@ -31,16 +31,16 @@ def train(
 
     Args:
         env: Environment name (see `midway envs`).
-        agent: Agent name.
-        preset: paper (table 1) or quick (two cores).
+        agent: ris, sac, tdm or leap, or PACKAGE.MODULE:NAME for an agent of your own.
+        preset: paper (table 1), quick (two cores), or a file ending in .toml.
         steps: Environment steps; default: the preset's.
         seed: The one seed of every generator.
         num_envs: Parallel environments; default: the preset's.
         out: Run folder; default: runs/ENV-AGENT-seedN.
-        precision: Products in float32 or bfloat16; default: the preset's.
+        precision: Matrix products in float32 or bfloat16; default: the preset's.
         set: Other settings of the preset, as NAME=VALUE.
     """
-    from midway.training import api
+    from midway import api
 
     run = api.train(
         env,
@@ -67,7 +67,7 @@ def resume(
         steps: New total of environment steps; default: the run's own.
         devices: New number of accelerators; default: the run's own.
     """
-    from midway.training import api
+    from midway import api
 
     _say_where(api.resume(run, steps=steps, devices=devices, progress=True))
 
@@ -90,7 +90,7 @@ def evaluate(
         seed: Seed of starts and goals.
         json: Print one JSON object, with every episode.
     """
-    from midway.training import api
+    from midway import api
 
     result = api.evaluate(run, episodes=episodes, task=task, actions=actions, seed=seed)
     if json:
@@ -141,8 +141,8 @@ def sweep(
     from rich.console import Console
     from rich.live import Live
 
+    from midway import api
     from midway.cluster import sweep as sweeps
-    from midway.training import api
 
     changes = settings(set) | ({} if steps is None else {"steps": steps})
     for env in envs:
@@ -220,12 +220,12 @@ def bench(
         env: Environment name.
         agent: Agent name.
         batch: Transitions of one update.
-        precision: Products in float32 or bfloat16.
-        num_envs: Copies of the environment that are stepped together in env.
+        precision: Matrix products in float32 or bfloat16.
+        num_envs: Environments that are stepped together in env.
         json: Print one JSON object.
     """
-    from midway.training import bench as measure
-    from midway.training import bench_plan
+    from midway.bench import pieces as measure
+    from midway.bench import plan as bench_plan
 
     pieces: dict[str, Callable[[], dict[str, Any]]] = {
         "update": lambda: measure.update(env, agent, batch, precision),
@@ -284,6 +284,41 @@ def doctor(json: bool = False) -> None:
         sys.exit(EXIT_FAILED)
 
 
+def presets(
+    env: Positional[str] = "ant-u",
+    agent: Positional[str] = "ris",
+    preset: str = "quick",
+    set: tuple[str, ...] = (),
+    json: bool = False,
+) -> None:
+    """Print every setting of a preset with its value and where that comes from.
+
+    Args:
+        env: Environment name.
+        agent: Agent name.
+        preset: paper, quick, or a file ending in .toml.
+        set: Other settings of the preset, as NAME=VALUE.
+        json: Print one JSON object.
+    """
+    from midway import presets as rules
+    from midway import settings as declarations
+
+    resolved = rules.resolve(env, agent, preset, settings(set))
+    rows = [
+        (name, value, resolved.sources.get(name, rules.Source("default of the agent")), allowed)
+        for config in (resolved.train, resolved.hyperparameters)
+        for name, value, allowed in declarations.declared(config)
+    ]
+    if json:
+        _print_json(
+            {name: {"value": plain(value), **source._asdict()} for name, value, source, _ in rows}
+        )
+        return
+    for name, value, source, allowed in rows:
+        mark = f" [not the paper's: {source.deviates}]" if source.deviates else ""
+        print(f"{name:22} {plain(value)!s:22} {allowed.meaning:38} {source.source}{mark}".rstrip())
+
+
 COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "resume": resume,
@@ -293,6 +328,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "watch": watch,
     "bench": bench,
     "envs": envs,
+    "presets": presets,
     "doctor": doctor,
 }
 

@@ -1,6 +1,7 @@
 """What users type: numbers, settings and commands, with one clear line for what is wrong."""
 
 import contextlib
+import dataclasses
 import functools
 import io
 import re
@@ -93,3 +94,8 @@ def settings(words: Sequence[str]) -> dict[str, str]:
             raise ConfigurationError(f"--set {word!r}: write NAME=VALUE")
         changes[name.replace("-", "_")] = value
     return changes
+
+
+def plain(value: Any) -> Any:
+    """Return a setting's value as JSON has it: a group of settings as its parts."""
+    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value  # type: ignore[arg-type]

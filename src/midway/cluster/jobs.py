@@ -1,6 +1,5 @@
 """One run of a sweep: its command, its folder, and how far it is."""
 
-import csv
 import subprocess
 import sys
 import time
@@ -8,7 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from midway.training.folder import RunFolder
+import numpy as np
+
+from midway import tables
+from midway.runs.folder import RunFolder, run_name
+from midway.types import ConfigurationError
 
 State: TypeAlias = Literal["waiting", "running", "finished", "failed"]
 
@@ -37,8 +40,8 @@ class Job:
     @property
     def name(self) -> str:
         """Name of its run folder."""
-        parts = (self.env.replace("/", "-"), self.agent, self.label, f"seed{self.seed}")
-        return "-".join(part for part in parts if part)
+        agent = f"{self.agent}-{self.label}" if self.label else self.agent
+        return run_name(self.env, agent, self.seed)
 
     def command(self, folder: Path) -> list[str]:
         """Return the command that starts the run, or continues it where there is one."""
@@ -83,10 +86,10 @@ def finished(job: Job, folder: Path) -> bool:
 def last_success(evaluation: Path) -> tuple[int | None, float | None]:
     """Return step and success of the last evaluation: mean actions, ``hard`` if it is there."""
     try:
-        with evaluation.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row.get("actions") == "mean"]
-        last = [row for row in rows if row["step"] == rows[-1]["step"]]
-        row = next((row for row in last if row["task"] == "hard"), last[0])
-        return int(row["step"]), float(row["success_rate"])
-    except (OSError, IndexError, TypeError, ValueError):
+        table = tables.read(evaluation)
+        last = (table["actions"] == "mean") & (table["step"] == table["step"].max())
+        hard = last & (table["task"] == "hard")
+        row = np.flatnonzero(hard if hard.any() else last)[0]
+        return int(table["step"][row]), float(table["success_rate"][row])
+    except (ConfigurationError, KeyError, IndexError, ValueError):
         return None, None

@@ -15,7 +15,7 @@ from typing import Any
 
 from midway.cluster import on_ray
 from midway.cluster.jobs import POLL_SECONDS, Job, State, execute, finished, last_success
-from midway.training.folder import RunFolder
+from midway.runs.folder import RunFolder
 from midway.types import ConfigurationError
 
 

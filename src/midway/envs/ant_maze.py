@@ -120,6 +120,17 @@ def encode_rotation(quaternion: Float[Array, "n 4"]) -> Float[Array, "n 6"]:
     )
 
 
+CENTER = (
+    *(0.0, 0.0, 0.56, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0),
+    *(0.0, 0.86, 0.0, -0.86, 0.0, -0.86, 0.0, 0.86),
+)
+"""Middle of the entries of an observation before the velocities: upright, ankles half bent."""
+
+SPREAD = (3.3, 3.3, 0.1, 0.7, 0.7, 0.1, 0.15, 0.1, 0.15, *4 * (0.41, 0.3))
+SPREAD_OF_VELOCITIES = (0.45, 0.45, 0.4, 0.6, 0.6, 0.7, *4 * (1.57, 1.27))
+"""Deviations from it of ants that walk, rounded; x and y in one unit (m, rad, m/s, rad/s)."""
+
+
 class AntMazeVectorEnv(MazeVectorEnv):
     """Ants in a maze; observation and goal are the same 31 numbers.
 
@@ -141,6 +152,9 @@ class AntMazeVectorEnv(MazeVectorEnv):
 
     body_radius = TORSO_RADIUS
     logged_info: ClassVar[Mapping[str, str]] = {"flipped": "flip_rate"}
+
+    center = (*CENTER, *14 * (0.0,))
+    spread = (*SPREAD, *SPREAD_OF_VELOCITIES)
 
     def __init__(
         self, maze: str, num_envs: int = 1, task: str = "uniform", num_threads: int = 0

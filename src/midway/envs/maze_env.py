@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -42,6 +42,10 @@ class MazeVectorEnv(SimulationVectorEnv):
     """
 
     option_names = (*SimulationVectorEnv.option_names, "start", "goal")
+    center: ClassVar[tuple[float, ...]] = ()
+    """Typical middle of each entry of the observation, where it is known."""
+    spread: ClassVar[tuple[float, ...]] = ()
+    """Typical deviation of each entry from it; x and y in one unit."""
     body_radius: float
     """Radius of the robot's solid middle (m), which no start or goal can have in a wall."""
 
@@ -68,6 +72,8 @@ class MazeVectorEnv(SimulationVectorEnv):
             goal_is_observation=True,
             state_shape=None,
             task=DistanceTask(groups=((0, 1),), threshold=GOAL_THRESHOLD),
+            center=self.center,
+            spread=self.spread,
         )
         super().__init__(
             model=model,

@@ -1,100 +1,152 @@
-"""The environments by the names that users type."""
+"""The environments by the names that users type: one declaration each."""
 
+import importlib
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
-from midway.envs.ant_maze import AntMazeVectorEnv
-from midway.envs.foreign import Foreign, ForeignVectorEnv, described
-from midway.envs.ids import GYM_IDS
-from midway.envs.mazes import MAZES
-from midway.envs.point_maze import PointMazeVectorEnv
-from midway.envs.push import PushStateVectorEnv, PushVectorEnv
-from midway.envs.push_scene import TASKS
-from midway.envs.sources import UnknownEnvironmentError
-from midway.envs.vector import GoalVectorEnv
+import gymnasium
+
+from midway.envs.mazes import MAZES, Maze
+from midway.envs.views import MazeView, TableView, View
 from midway.types import ConfigurationError
+
+if TYPE_CHECKING:
+    from midway.envs.foreign import Foreign
+    from midway.envs.vector import GoalVectorEnv
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One environment of the registry.
+class Declaration:
+    """All that the package knows of an environment before it is made.
 
     Attributes:
         name: The name that users type, such as ``ant-u``.
         gym_id: Its Gymnasium id.
+        family: What it has in common with others: ``point``, ``ant``, ``push`` or ``other``.
         description: One line for lists of environments.
         tasks: Names of the tasks, the training task first.
-        factory: ``(num_envs=, task=, num_threads=) -> GoalVectorEnv``.
+        entry_point: ``module:class`` of its vector environment, imported when it is made.
+        arguments: Arguments of that class besides ``num_envs``, ``task`` and ``num_threads``.
+        view: How it is drawn from above, if it is.
+        steps: Environment steps of the preset ``quick``.
     """
 
     name: str
     gym_id: str
+    family: str
     description: str
     tasks: tuple[str, ...]
-    factory: Callable[..., GoalVectorEnv]
+    entry_point: str
+    arguments: dict[str, Any] = field(default_factory=dict, hash=False)
+    view: View | None = None
+    steps: int = 32_000
+
+    def factory(self, **options: Any) -> "GoalVectorEnv":
+        """Return the vector environment with ``num_envs``, ``task`` and ``num_threads``."""
+        module, name = self.entry_point.split(":")
+        made: Callable[..., GoalVectorEnv] = getattr(importlib.import_module(module), name)
+        return made(**self.arguments, **options)
 
 
-def _maze_entries(
-    robot: str, description: str, factory: Callable[..., GoalVectorEnv]
-) -> list[Entry]:
-    return [
-        Entry(
-            name=f"{robot}-{maze.name}",
-            gym_id=GYM_IDS[f"{robot}-{maze.name}"],
-            description=f"{description} in the {maze.title} maze",
+def _in_mazes(
+    family: str, robot: str, entry_point: str, upright: tuple[int, int] | None, budgets: list[int]
+) -> list[Declaration]:
+    """Declare a robot in each maze; the budgets are those of the mazes in order."""
+    title = f"{family.capitalize()}Maze"
+
+    def declare(maze: Maze, steps: int) -> Declaration:
+        return Declaration(
+            name=f"{family}-{maze.name}",
+            gym_id=f"midway/{title}-{maze.name.capitalize()}-v0",
+            family=family,
+            description=f"{robot} in the {maze.title} maze",
             tasks=tuple(maze.cases),
-            factory=partial(factory, maze.name),
+            entry_point=entry_point,
+            arguments={"maze": maze.name},
+            view=MazeView(maze, upright),
+            steps=steps,
         )
-        for maze in MAZES.values()
-    ]
+
+    return [declare(maze, steps) for maze, steps in zip(MAZES.values(), budgets, strict=True)]
 
 
-def _push_entry(name: str, description: str, factory: Callable[..., GoalVectorEnv]) -> Entry:
-    return Entry(name, GYM_IDS[name], description, tuple(TASKS), factory)
+def _push(name: str, gym_id: str, description: str, kind: str, steps: int) -> Declaration:
+    return Declaration(
+        name=name,
+        gym_id=gym_id,
+        family="push",
+        description=description,
+        tasks=("uniform", "hard", "near"),
+        entry_point=f"midway.envs.push:{kind}",
+        view=TableView(),
+        steps=steps,
+    )
 
 
-ENVIRONMENTS: dict[str, Entry] = {
-    entry.name: entry
-    for entry in [
-        *_maze_entries("point", "point mass", PointMazeVectorEnv),
-        *_maze_entries("ant", "four-legged ant", AntMazeVectorEnv),
-        _push_entry("push", "arm that pushes a puck, seen in images", PushVectorEnv),
-        _push_entry("push-state", "the same arm, with states for images", PushStateVectorEnv),
+POINT = "midway.envs.point_maze:PointMazeVectorEnv"
+ANT = "midway.envs.ant_maze:AntMazeVectorEnv"
+IMAGES, STATES = "arm that pushes a puck, seen in images", "the same arm, with states for images"
+
+ENVIRONMENTS: dict[str, Declaration] = {
+    declared.name: declared
+    for declared in [
+        *_in_mazes("point", "point mass", POINT, None, [32_000, 32_000, 32_000, 48_000]),
+        *_in_mazes("ant", "four-legged ant", ANT, (5, 7), 4 * [160_000]),
+        _push("push", "midway/Push-v0", IMAGES, "PushVectorEnv", 400_000),
+        _push("push-state", "midway/PushState-v0", STATES, "PushStateVectorEnv", 60_000),
     ]
 }
-"""Every environment by name, in the order of lists."""
+"""Every environment of this package by name, in the order of lists."""
 
 
-def entry(env: str | Foreign) -> Entry:
-    """Return the entry of an environment, of a foreign one too, by its name or as described.
+def register_ids() -> None:
+    """Register every environment with Gymnasium, single and vector."""
+    for name, declared in ENVIRONMENTS.items():
+        gymnasium.register(
+            id=declared.gym_id,
+            entry_point="midway.envs.single:SingleGoalEnv",
+            vector_entry_point="midway.envs.registry:make_vec",
+            kwargs={"name": name},
+        )
+
+
+def entry(env: "str | Foreign") -> Declaration:
+    """Return the declaration of an environment, by its name or as `foreign.describe` returned it.
 
     Raises:
         ConfigurationError: There is none of this name, or midway cannot use it.
     """
-    if isinstance(env, Foreign):
-        factory = partial(ForeignVectorEnv, env)
-        return Entry(env.spec.name, env.spec.name, env.rule.description, ("uniform",), factory)
-    if env in ENVIRONMENTS:
+    if isinstance(env, str) and env in ENVIRONMENTS:
         return ENVIRONMENTS[env]
+    from midway.envs import foreign, sources
+
     try:
-        return entry(described(env))
-    except UnknownEnvironmentError as error:
-        own = ", ".join(ENVIRONMENTS)
+        described = foreign.described(env) if isinstance(env, str) else env
+    except sources.UnknownEnvironmentError as error:
         raise ConfigurationError(
-            f"{error}; midway's own are {own}, and any goal environment goes by its Gymnasium id "
-            "or module:name"
+            f"{error}; midway's own are {', '.join(ENVIRONMENTS)}, and any goal environment goes "
+            "by its Gymnasium id or module:name"
         ) from error
+    return Declaration(
+        name=described.spec.name,
+        gym_id=described.source.reference,
+        family="other",
+        description=described.rule.description,
+        tasks=("uniform",),
+        entry_point="midway.envs.foreign:ForeignVectorEnv",
+        arguments={"foreign": described},
+    )
 
 
 def make_vec(
-    name: str | Foreign, num_envs: int = 1, task: str = "uniform", num_threads: int = 0
-) -> GoalVectorEnv:
-    """Return copies of an environment that are stepped together.
+    name: "str | Foreign", num_envs: int = 1, task: str = "uniform", num_threads: int = 0
+) -> "GoalVectorEnv":
+    """Return environments that are stepped together.
 
     Args:
         name: A name of the registry, such as ``point-u``, or what ``foreign.describe`` returned.
-        num_envs: Number of copies.
+        num_envs: Number of environments.
         task: A task of the environment: what starts and goals are drawn from.
         num_threads: Threads that simulate; 0 chooses. Results do not depend on it.
 

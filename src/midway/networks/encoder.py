@@ -1,19 +1,26 @@
-"""From observations to the codes that policies and critics read."""
+"""From observations to the features that policies and critics read."""
 
-from typing import Protocol, TypeAlias, runtime_checkable
+import math
+from collections.abc import Callable
+from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, Shaped, UInt8
+from jaxtyping import Array, Float, Key, Shaped, UInt8
 
 from midway.networks.convolution import Filter, in_blocks
 from midway.networks.initialization import with_centre_tap, with_orthogonal_weight
 from midway.networks.mlp import Linear, Precision
-from midway.types import Batch, ConfigurationError, EnvSpec
+from midway.types import Batch, ConfigurationError, EnvSpec, Subgoal
 
-CODE_SIZE = 16
-"""Numbers of an image's code (appendix B)."""
+NUM_FEATURES = 16
+"""Features of an image (appendix B)."""
+
+LARGEST_FEATURE = 5.0
+"""Bound of normalised entries: an ant on its back lies 20 deviations off."""
+
+T = TypeVar("T")
 
 CHANNELS = 32
 STRIDES = (2, 2, 2, 1)
@@ -28,35 +35,45 @@ class EncoderConfig(Protocol):
     """What an encoder needs of an agent's configuration."""
 
     @property
-    def image_translation(self) -> int:
-        """Largest random translation of an image along each axis (pixels)."""
+    def random_shift(self) -> int:
+        """Largest random shift of an image along each axis (pixels)."""
 
     @property
     def image_pooling(self) -> int:
         """Side of the squares of pixels that are averaged before the convolutions."""
 
     @property
-    def encoder_updates(self) -> int:
-        """Updates after which the encoder stays as it is; 0 for never."""
+    def normalise(self) -> bool:
+        """Whether states are read relative to their typical middle and deviation."""
 
     @property
     def precision(self) -> Precision:
-        """Factors of products are rounded to it."""
+        """Inputs of matrix products are rounded to it."""
 
 
 class StateEncoder(eqx.Module):
     """States relative to the environment's origin, in its unit: the state itself in most."""
 
     origin: tuple[float, ...] = eqx.field(static=True)
-    unit: float = eqx.field(static=True)
+    unit: float | tuple[float, ...] = eqx.field(static=True)
+    bound: float = eqx.field(static=True, default=math.inf)
 
     def __call__(self, observation: Float[Array, "B S"]) -> Float[Array, "B S"]:
-        """Return (state - origin) / unit."""
-        return (observation - self._shift) / self.unit
+        """Return (state - origin) / unit, within ± bound."""
+        features = (observation - self._shift) / self._unit
+        return features if math.isinf(self.bound) else jnp.clip(features, -self.bound, self.bound)
 
-    def states(self, code: Float[Array, "*B S"]) -> Float[Array, "*B S"]:
-        """Return the states that codes stand for, in the units of the environment."""
-        return code * self.unit + self._shift
+    def states(self, features: Float[Array, "*B S"]) -> Float[Array, "*B S"]:
+        """Return the states that features stand for, in the units of the environment."""
+        return features * self._unit + self._shift
+
+    def spread(self, scale: Float[Array, "*B S"]) -> Float[Array, "*B S"]:
+        """Return scales of features in the units of the environment."""
+        return scale * self._unit
+
+    @property
+    def _unit(self) -> Float[Array, "..."]:
+        return jnp.asarray(self.unit)
 
     @property
     def _shift(self) -> Float[Array, "..."]:
@@ -76,13 +93,13 @@ class ImageEncoder(eqx.Module):
 
     convolutions: tuple[Filter, ...]
     linear: Linear
-    translation: int = eqx.field(static=True)
+    random_shift: int = eqx.field(static=True)
     pooling: int = eqx.field(static=True)
 
     def __init__(
         self, image_shape: tuple[int, ...], config: EncoderConfig, *, key: Key[Array, ""]
     ) -> None:
-        self.translation, self.pooling = config.image_translation, config.image_pooling
+        self.random_shift, self.pooling = config.random_shift, config.image_pooling
         keys = jax.random.split(key, len(STRIDES) + 1)
         height, width = (side // self.pooling for side in image_shape[:2])
         channels = image_shape[2]
@@ -92,35 +109,35 @@ class ImageEncoder(eqx.Module):
             layers.append(with_centre_tap(layer, layer_key))
             height, width = (height - 3) // stride + 1, (width - 3) // stride + 1
             channels = CHANNELS
-        linear = Linear(height * width * channels, CODE_SIZE, config.precision, key=keys[-1])
+        linear = Linear(height * width * channels, NUM_FEATURES, config.precision, key=keys[-1])
         self.convolutions = tuple(layers)
         self.linear = with_orthogonal_weight(linear, keys[-1])
 
-    def __call__(
-        self, image: UInt8[Array, "B H W 3"] | Float[Array, "B 16"]
-    ) -> Float[Array, "B 16"]:
-        """Return the codes of images; codes are returned as they are."""
-        if is_code(image):
-            return image
+    def __call__(self, image: UInt8[Array, "B H W 3"]) -> Float[Array, "B 16"]:
+        """Return the features of images."""
 
-        def codes(image: UInt8[Array, "b H W 3"]) -> Float[Array, "b 16"]:
+        def features(image: UInt8[Array, "b H W 3"]) -> Float[Array, "b 16"]:
             x = pooled(image.astype(jnp.float32) / 255, self.pooling)
             for layer in self.convolutions:
                 x = jax.nn.relu(layer.reduce(x))
             return self.linear(x.reshape(len(x), -1))
 
-        found: Float[Array, "B 16"] = in_blocks(codes, image)
+        found: Float[Array, "B 16"] = in_blocks(features, image)
         return found
 
-    def states(self, code: Float[Array, "*B 16"]) -> Float[Array, "*B 16"]:
-        """Return the codes: they are not decoded here."""
-        return code
+    def states(self, features: Float[Array, "*B 16"]) -> Float[Array, "*B 16"]:
+        """Return the features: they are not decoded here."""
+        return features
 
-    def augment(self, image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Shaped[Array, "B ..."]:
-        """Return each image moved by offsets of its own, with a black rim (appendix B)."""
-        if is_code(image):
-            return image
-        rim = self.translation
+    def spread(self, scale: Float[Array, "*B 16"]) -> Float[Array, "*B 16"]:
+        """Return the scales of features as they are."""
+        return scale
+
+    def augment(
+        self, image: UInt8[Array, "B H W 3"], key: Key[Array, ""]
+    ) -> UInt8[Array, "B H W 3"]:
+        """Return each image shifted by random offsets of its own, on black (appendix B)."""
+        rim = self.random_shift
         framed = jnp.pad(image, ((0, 0), (rim, rim), (rim, rim), (0, 0)))
         corners = jax.random.randint(key, (len(image), 2), 0, 2 * rim + 1)
 
@@ -138,11 +155,6 @@ def pooled(image: Float[Array, "B H W C"], side: int) -> Float[Array, "B h w C"]
     return squares.mean((2, 4))
 
 
-def is_code(image: Shaped[Array, "B ..."]) -> bool:
-    """Return whether these are codes already, kept because their encoder learns no more."""
-    return image.ndim == 2
-
-
 Encoder: TypeAlias = StateEncoder | ImageEncoder
 
 
@@ -150,13 +162,10 @@ def create(spec: EnvSpec, config: EncoderConfig, key: Key[Array, ""]) -> Encoder
     """Return the encoder that suits the environment's observations.
 
     Raises:
-        ConfigurationError: A number below 0, or squares to average that do not tile images.
+        ConfigurationError: The squares to average do not tile images.
     """
     if spec.is_image:
         pooling = config.image_pooling
-        for name in ("image_translation", "encoder_updates"):
-            if getattr(config, name) < 0:
-                raise ConfigurationError(f"{name} {getattr(config, name)}: must not be below 0")
         sides = spec.observation_shape[:2]
         if pooling < 1 or any(s % pooling or s // pooling < SMALLEST_IMAGE for s in sides):
             raise ConfigurationError(
@@ -164,50 +173,81 @@ def create(spec: EnvSpec, config: EncoderConfig, key: Key[Array, ""]) -> Encoder
                 f"and leave {SMALLEST_IMAGE}"
             )
         return ImageEncoder(spec.observation_shape, config, key=key)
+    if config.normalise and spec.spread:
+        return StateEncoder(spec.center, spec.spread, LARGEST_FEATURE)
     return StateEncoder(spec.origin, spec.unit)
 
 
-def code_sizes(spec: EnvSpec) -> tuple[int, int]:
-    """Return the sizes of an observation's and a goal's code."""
+def feature_sizes(spec: EnvSpec) -> tuple[int, int]:
+    """Return the numbers of features of an observation and of a goal."""
     if spec.is_image:
-        return CODE_SIZE, CODE_SIZE
+        return NUM_FEATURES, NUM_FEATURES
     return spec.observation_shape[0], spec.goal_shape[0]
 
 
-def learns(
-    encoder: Encoder,
-    config: EncoderConfig,
-    observation: Shaped[Array, "B ..."],
-    updates: Int[Array, ""],
-) -> bool | Bool[Array, ""]:
-    """Return whether the encoder learns from these observations, after so many updates.
-
-    That of states, which has nothing to learn, always does, and none learns from codes.
-    """
-    if config.encoder_updates == 0 or isinstance(encoder, StateEncoder):
-        return True
-    if is_code(observation):
-        return False
-    return updates < config.encoder_updates
+def scale(encoder: Encoder) -> float:
+    """Return how many of the environment's units one unit of the first feature is."""
+    unit = getattr(encoder, "unit", 1.0)
+    return float(unit[0] if isinstance(unit, tuple) else unit)
 
 
-def encode_fixed(
-    encoder: Encoder, batch: Batch, learns: bool | Bool[Array, ""], key: Key[Array, ""]
+def subgoal_size(spec: EnvSpec) -> int:
+    """Return the length of a subgoal as one vector: of both roles where they differ."""
+    observation, goal = feature_sizes(spec)
+    return observation if spec.goal_is_observation else observation + goal
+
+
+def as_subgoal(spec: EnvSpec, vector: Float[Array, "*B S"]) -> Subgoal:
+    """Split a vector into the state it is started from and the goal it is reached as."""
+    if spec.goal_is_observation:
+        return Subgoal(vector, vector)
+    size = feature_sizes(spec)[0]
+    return Subgoal(vector[..., :size], vector[..., size:])
+
+
+def as_vector(spec: EnvSpec, subgoal: Subgoal) -> Shaped[Array, "*B S"]:
+    """Join both roles of a subgoal into one vector."""
+    if spec.goal_is_observation:
+        return subgoal.observation
+    return jnp.concatenate(subgoal, axis=-1)
+
+
+def encode_batch(
+    encoder: Encoder, batch: Batch, key: Key[Array, ""]
 ) -> tuple[Shaped[Array, "B ..."], Batch]:
-    """Return the augmented observations, and the batch with fixed codes of what follows them.
+    """Return the augmented observations, and the batch with features of what follows them.
 
-    Images are augmented while the encoder learns. Next observations and goals are encoded without
-    gradient; only the current observation is left to be encoded within the critics' loss.
+    Next observations and goals are encoded without gradient; only the current observation is left
+    to be encoded within the critics' loss (appendix B, vision based environments).
     """
     keys = jax.random.split(key, 3)
 
-    def augmented(image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Shaped[Array, "B ..."]:
-        return jnp.where(learns, encoder.augment(image, key), image)
+    def features(image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Float[Array, "B S"]:
+        return jax.lax.stop_gradient(encoder(encoder.augment(image, key)))
 
-    def code(image: Shaped[Array, "B ..."], key: Key[Array, ""]) -> Float[Array, "B S"]:
-        return jax.lax.stop_gradient(encoder(augmented(image, key)))
-
-    fixed = batch._replace(
-        next_observation=code(batch.next_observation, keys[1]), goal=code(batch.goal, keys[2])
+    encoded = batch._replace(
+        next_observation=features(batch.next_observation, keys[1]),
+        goal=features(batch.goal, keys[2]),
     )
-    return augmented(batch.observation, keys[0]), fixed
+    return encoder.augment(batch.observation, keys[0]), encoded
+
+
+def candidates(encoder: Encoder, batch: Batch, features: Float[Array, "B S"]) -> Subgoal:
+    """Return the features of the states drawn from replay as subgoal candidates (eq. 17).
+
+    For images these are the features of the batch's own observations, each beside another
+    transition: as uniform as any draws, and no further pass through the encoder.
+    """
+    if isinstance(encoder, StateEncoder):
+        return Subgoal(*map(encoder, batch.subgoal_candidate))
+    shifted = jnp.roll(features, 1, axis=0)
+    return Subgoal(shifted, shifted)
+
+
+def on_observations(function: Callable[..., T]) -> Callable[..., T]:
+    """Return a function of (state, features, features) as one of what the environment shows."""
+
+    def read(state: Any, observation: Any, goal: Any, *others: Any) -> T:
+        return function(state, state.encoder(observation), state.encoder(goal), *others)
+
+    return read

@@ -1,7 +1,7 @@
-"""Multilayer perceptrons, with products in float32 or bfloat16."""
+"""Multilayer perceptrons, with matrix products in float32 or bfloat16."""
 
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import equinox as eqx
 import jax
@@ -10,12 +10,14 @@ from jaxtyping import Array, BFloat16, Float, Key
 
 Precision: TypeAlias = Literal["f32", "bf16"]
 
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+
 DTYPES = {"f32": jnp.float32, "bf16": jnp.bfloat16}
-"""What the inputs of products are rounded to."""
+"""What the inputs of matrix products are rounded to."""
 
 
 def fastest_precision() -> Precision:
-    """Return ``bf16`` where products of bfloat16 have instructions of their own, else ``f32``.
+    """Return ``bf16`` where the processor multiplies bfloat16 matrices itself, else ``f32``.
 
     On processors that is AVX512-BF16 or AMX, on other devices it is taken for granted.
     """
@@ -99,6 +101,12 @@ class Linear(eqx.Module):
         return self.product(x) + self.bias
 
 
+def normalised(x: Float[Array, "*B H"]) -> Float[Array, "*B H"]:
+    """Return x with mean 0 and variance 1 over the last axis (layer norm without parameters)."""
+    centered = x - x.mean(-1, keepdims=True)
+    return centered * jax.lax.rsqrt((centered**2).mean(-1, keepdims=True) + 1e-5)
+
+
 class MLP(eqx.Module):
     """ReLU layers over the concatenation of the inputs (table 1: two hidden layers of 256).
 
@@ -108,6 +116,7 @@ class MLP(eqx.Module):
     """
 
     layers: tuple[Linear, ...]
+    layer_norm: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -117,7 +126,9 @@ class MLP(eqx.Module):
         precision: Precision,
         *,
         key: Key[Array, ""],
+        layer_norm: bool = False,
     ) -> None:
+        self.layer_norm = layer_norm
         sizes = (in_size, *hidden, out_size)
         keys = jax.random.split(key, len(sizes) - 1)
         self.layers = tuple(
@@ -129,7 +140,7 @@ class MLP(eqx.Module):
         """Return the output ``(*B, O)`` for inputs ``(*B_i, I_i)`` with broadcastable ``B_i``."""
         x = self._first_layer(inputs)
         for layer in self.layers[1:]:
-            x = layer(jax.nn.relu(x))
+            x = layer(jax.nn.relu(normalised(x) if self.layer_norm else x))
         return x
 
     def _first_layer(self, inputs: tuple[Float[Array, "..."], ...]) -> Float[Array, "..."]:

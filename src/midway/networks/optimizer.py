@@ -5,13 +5,12 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Int, PyTree
 
 Network = TypeVar("Network", bound=PyTree)
 State = TypeVar("State")
+Others = TypeVar("Others")
 
 
 def init(network: PyTree) -> optax.OptState:
@@ -27,46 +26,47 @@ def step(
     return eqx.apply_updates(network, updates), state
 
 
+def minimise(
+    loss: Callable[..., tuple[Array, Others]],
+    network: Network,
+    state: optax.OptState,
+    learning_rate: float,
+    *inputs: Any,
+) -> tuple[Network, optax.OptState, Others]:
+    """Return the network after one step of Adam, Adam's new state, and what else the loss gives."""
+    gradient_of: Callable[..., Any] = eqx.filter_value_and_grad(loss, has_aux=True)
+    (_, others), gradient = gradient_of(network, *inputs)
+    return *step(network, gradient, state, learning_rate), others
+
+
 def step_critic_and_encoder(
-    loss: Callable[..., Any], state: State, learns: bool | Bool[Array, ""], *inputs: Any
-) -> tuple[State, Any]:
+    loss: Callable[..., tuple[Array, Others]], state: State, *inputs: Any
+) -> tuple[State, Others]:
     """Return the agent's state after one step of critics and encoder, and what else the loss gives.
 
     Args:
         loss: A function of (critics, encoder) and the inputs: its value, and anything else.
         state: A state with both networks, their optimisers and rates.
-        learns: Whether the encoder steps as well; where it does not, its gradient is not computed.
         inputs: Of the loss.
     """
     agent: Any = state
-
-    def without_encoder(networks: tuple[Any, Any], *inputs: Any) -> Any:
-        return loss((networks[0], jax.lax.stop_gradient(networks[1])), *inputs)
-
-    def gradients(loss: Callable[..., Any]) -> Callable[[Any], Any]:
-        gradient_of: Callable[..., Any] = eqx.filter_value_and_grad(loss, has_aux=True)
-        return lambda networks: gradient_of(networks, *inputs)
-
-    networks = (agent.critic, agent.encoder)
-    if isinstance(learns, bool):
-        found = gradients(loss if learns else without_encoder)(networks)
-    else:
-        found = jax.lax.cond(learns, gradients(loss), gradients(without_encoder), networks)
-    (_, others), (critic_gradient, encoder_gradient) = found
+    gradient_of: Callable[..., Any] = eqx.filter_value_and_grad(loss, has_aux=True)
+    (_, others), gradients = gradient_of((agent.critic, agent.encoder), *inputs)
     rates = agent.config
-    critic, critic_optimizer = step(
-        agent.critic, critic_gradient, agent.critic_optimizer, rates.critic_learning_rate
+    critic = step(agent.critic, gradients[0], agent.critic_optimizer, rates.critic_learning_rate)
+    encoder = step(
+        agent.encoder, gradients[1], agent.encoder_optimizer, rates.encoder_learning_rate
     )
-    agent = replace(agent, critic=critic, critic_optimizer=critic_optimizer)
-    if learns is False:
-        return agent, others
-    before = (agent.encoder, agent.encoder_optimizer)
-    after = step(*(before[0], encoder_gradient, before[1], rates.encoder_learning_rate))
-    if learns is not True:
-        after = jax.tree.map(lambda new, old: jnp.where(learns, new, old), after, before)
-    return replace(agent, encoder=after[0], encoder_optimizer=after[1]), others
+    return replace(
+        agent,
+        critic=critic[0],
+        critic_optimizer=critic[1],
+        encoder=encoder[0],
+        encoder_optimizer=encoder[1],
+    ), others
 
 
-def updates(state: optax.OptState) -> Any:
+def updates(state: optax.OptState) -> Int[Array, ""]:
     """Return how many steps were taken."""
-    return optax.tree_utils.tree_get(state, "count")
+    count: Int[Array, ""] = optax.tree_utils.tree_get(state, "count")
+    return count

@@ -12,7 +12,9 @@ from midway.functional import (
     LOG_SCALE_MIN,
     gaussian_log_density,
     laplace_log_density,
+    tanh_log_determinant,
 )
+from midway.networks.inputs import PairInputs
 from midway.networks.mlp import MLP, Precision
 
 
@@ -25,6 +27,20 @@ class Gaussian(NamedTuple):
     def sample(self, noise: Float[Array, "*B A"]) -> Float[Array, "*B A"]:
         """Return mean + std * noise, the reparametrised pre-tanh action."""
         return self.mean + jnp.exp(self.log_std) * noise
+
+    def act(self, key: Key[Array, ""], explore: bool) -> Float[Array, "*B A"]:
+        """Return actions in [-1, 1]: sampled where ``explore``, else the tanh of the mean."""
+        if not explore:
+            return jnp.tanh(self.mean)
+        return jnp.tanh(self.sample(jax.random.normal(key, self.mean.shape)))
+
+    def squashed(
+        self, noise: Float[Array, "*B A"]
+    ) -> tuple[Float[Array, "*B A"], Float[Array, "*B"]]:
+        """Return tanh-squashed actions and their log-densities log π_θ(a | s, g)."""
+        pre_tanh = self.sample(noise)
+        log_density = self.log_density(pre_tanh) - tanh_log_determinant(pre_tanh)
+        return jnp.tanh(pre_tanh), log_density
 
     def log_density(self, pre_tanh: Float[Array, "*#B A"]) -> Float[Array, "*#B"]:
         """Return the log-density of pre-tanh actions, broadcast against the distributions."""
@@ -52,6 +68,7 @@ class GaussianPolicy(eqx.Module):
     """π_θ(a | s, g) = tanh N(μ_θ(s, g), Σ_θ(s, g)) (appendix B, actor-critic)."""
 
     network: MLP
+    inputs: PairInputs
 
     def __init__(
         self,
@@ -61,12 +78,14 @@ class GaussianPolicy(eqx.Module):
         precision: Precision,
         *,
         key: Key[Array, ""],
+        inputs: PairInputs | None = None,
     ) -> None:
+        self.inputs = inputs or PairInputs()
         self.network = MLP(input_size, hidden, 2 * action_dim, precision, key=key)
 
     def __call__(self, observation: Float[Array, "..."], goal: Float[Array, "..."]) -> Gaussian:
         """Return the distribution of pre-tanh actions; inputs may broadcast as in `MLP`."""
-        mean, log_std = jnp.split(self.network(observation, goal), 2, axis=-1)
+        mean, log_std = jnp.split(self.network(*self.inputs(observation, goal)), 2, axis=-1)
         return Gaussian(mean, jnp.clip(log_std, LOG_SCALE_MIN, LOG_SCALE_MAX))
 
 
@@ -74,6 +93,7 @@ class SubgoalPolicy(eqx.Module):
     """π^H_ψ(s_g | s, g), the high-level policy: a Laplace over states (appendix B)."""
 
     network: MLP
+    inputs: PairInputs
 
     def __init__(
         self,
@@ -83,10 +103,12 @@ class SubgoalPolicy(eqx.Module):
         precision: Precision,
         *,
         key: Key[Array, ""],
+        inputs: PairInputs | None = None,
     ) -> None:
+        self.inputs = inputs or PairInputs()
         self.network = MLP(input_size, hidden, 2 * subgoal_size, precision, key=key)
 
     def __call__(self, observation: Float[Array, "..."], goal: Float[Array, "..."]) -> Laplace:
         """Return the distribution of subgoals between each observation and goal."""
-        location, log_scale = jnp.split(self.network(observation, goal), 2, axis=-1)
+        location, log_scale = jnp.split(self.network(*self.inputs(observation, goal)), 2, axis=-1)
         return Laplace(location, jnp.clip(log_scale, LOG_SCALE_MIN, LOG_SCALE_MAX))

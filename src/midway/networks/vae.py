@@ -139,6 +139,16 @@ class ImageVAE(eqx.Module):
         return self
 
 
+class LatentMean(eqx.Module):
+    """The encoder of images that an autoencoder holds: the means of their latent numbers."""
+
+    vae: ImageVAE
+
+    def __call__(self, image: Shaped[Array, "B 84 84 3"]) -> Float[Array, "B L"]:
+        """Return the features of images."""
+        return self.vae.encode(image).mean
+
+
 def create(
     spec: EnvSpec, latent_size: int, hidden: tuple[int, ...], key: Key[Array, ""]
 ) -> StateVAE | ImageVAE:
@@ -146,7 +156,7 @@ def create(
 
     Where goals are not observations, a subgoal is both, and its state is their concatenation.
     """
-    if spec.is_image:
+    if spec.is_image or spec.image_shape:
         return ImageVAE(latent_size, key=key)
     size = spec.observation_shape[0] + (0 if spec.goal_is_observation else spec.goal_shape[0])
     return StateVAE(size, latent_size, hidden, key=key)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from midway.replay.relabel import Rows, draw, goal_rows, source_counts
+from midway.replay.relabel import FAR, Rows, draw, goal_rows, rows_between, source_counts
 from midway.replay.storage import (
     ReplayState,
     allocate,
@@ -29,6 +29,7 @@ from midway.types import (
     Observation,
     Outcome,
     RelabelMix,
+    Sampling,
     Subgoal,
 )
 
@@ -95,7 +96,12 @@ def add(
 
 
 def sample(
-    replay: ReplayState, spec: EnvSpec, mix: RelabelMix, batch_size: int, key: Key[Array, ""]
+    replay: ReplayState,
+    spec: EnvSpec,
+    mix: RelabelMix,
+    batch_size: int,
+    key: Key[Array, ""],
+    wanted: Sampling | None = None,
 ) -> Batch:
     """Return transitions drawn uniformly, with relabelled goals, and states as subgoal candidates.
 
@@ -103,19 +109,41 @@ def sample(
     Candidates are states drawn uniformly and independently of the transitions. There must be at
     least one transition (``num_transitions``); an empty replay gives a batch without meaning.
     """
+    wanted = wanted or Sampling()
     draw_key, goal_key = jax.random.split(key)
     _, num_random, _ = source_counts(mix, batch_size)
     has_next = jnp.arange(2 * batch_size + num_random) < batch_size
     pairs, states, others = _split(
         draw(replay, has_next, draw_key), batch_size, batch_size + num_random
     )
-    current, following = (pairs.lane, pairs.position), (pairs.lane, pairs.position + 1)
-    candidate, goal = (others.lane, others.position), goal_rows(pairs, states, mix, goal_key)
-
     goals = "observation" if spec.goal_is_observation else "achieved_goal"
     truth = goals if spec.state_shape is None else "achieved_state"
-    outcome = Outcome(read(replay, truth, *following), read(replay, truth, *goal))
+
+    def is_reached(lane: Any, position: Any, desired: Any) -> Bool[Array, " B"]:
+        reached: Bool[Array, " B"] = spec.task(read(replay, truth, lane, position), desired)[1]
+        return reached
+
+    current, candidate = (pairs.lane, pairs.position), (others.lane, others.position)
+    goal, ahead = goal_rows(pairs, states, mix, goal_key)
+    if wanted.unreached:
+        there = is_reached(*current, read(replay, truth, *goal))
+        elsewhere = jax.tree.map(lambda x: jnp.roll(x, 1), candidate)
+        goal = jax.tree.map(lambda new, old: jnp.where(there, new, old), elsewhere, goal)
+        ahead = jnp.where(there, FAR, ahead)
+    desired = read(replay, truth, *goal)
+    if wanted.reached_in or wanted.between:
+        at_end = is_reached(pairs.lane, pairs.last, desired)
+        ahead = jnp.where((ahead == FAR) & at_end, pairs.last - pairs.position, ahead)
+
+    steps = jnp.ones(batch_size, jnp.int32)
+    for number in range(1, wanted.n_step):
+        done = is_reached(pairs.lane, pairs.position + number, desired)
+        more = (steps == number) & ~done & (pairs.position + number < pairs.last)
+        steps = steps + more
+    following = (pairs.lane, pairs.position + steps)
+    outcome = Outcome(read(replay, truth, *following), desired)
     reward, terminated = spec.task(*outcome)
+    between = rows_between(pairs, others, ahead, goal_key)
     return Batch(
         observation=read(replay, "observation", *current),
         action=read(replay, "action", *current),
@@ -127,6 +155,9 @@ def sample(
             read(replay, "observation", *candidate), read(replay, goals, *candidate)
         ),
         outcome=None if truth == "observation" else outcome,
+        steps=steps.astype(jnp.float32) if wanted.n_step > 1 else None,
+        reached_in=ahead.astype(jnp.float32) if wanted.reached_in else None,
+        between=read(replay, "observation", *between) if wanted.between else None,
     )
 
 

@@ -9,6 +9,9 @@ from jaxtyping import Array, Bool, Int, Key, UInt32
 from midway.replay.storage import ReplayState, bounds, live
 from midway.types import RelabelMix
 
+FAR = 10**6
+"""Steps to a goal that the episode is not known to reach: more than any episode has."""
+
 
 class Rows(NamedTuple):
     """Drawn rows, and the bounds of their episodes.
@@ -80,15 +83,44 @@ def source_counts(mix: RelabelMix, batch_size: int) -> tuple[int, int, int]:
 
 def goal_rows(
     pairs: Rows, states: Rows, mix: RelabelMix, key: Key[Array, ""]
-) -> tuple[Int[Array, " B"], Int[Array, " B"]]:
-    """Return lane and position of the row that holds the goal of each drawn transition.
+) -> tuple[tuple[Int[Array, " B"], Int[Array, " B"]], Int[Array, " B"]]:
+    """Return lane and position of the row that holds each transition's goal, and its steps ahead.
 
     The batch is split into one block for each source; transitions are independent draws, so this
-    favours none. Random goals are the drawn ``states``. Future goals are uniform over the later
-    states of the episode, the transition's own next state included.
+    favours none. Random goals are the drawn ``states``. Future goals are later states of the
+    episode, the transition's own next state included; the others are `FAR` ahead.
     """
-    own, random, num_future = source_counts(mix, pairs.lane.shape[0])
+    own, random, _ = source_counts(mix, pairs.lane.shape[0])
     future = jax.tree.map(lambda leaf: leaf[own + random :], pairs)
-    steps = 1 + below(jax.random.bits(key, (num_future,)), future.last - future.position)
+    steps = steps_ahead(future.last - future.position, mix.future_discount, key)
     lane = jnp.concatenate([pairs.lane[:own], states.lane, future.lane])
-    return lane, jnp.concatenate([pairs.first[:own], states.position, future.position + steps])
+    rows = (pairs.first[:own], states.position, future.position + steps)
+    ahead = jnp.concatenate([jnp.full(own + random, FAR, jnp.int32), steps])
+    return (lane, jnp.concatenate(rows)), ahead
+
+
+def rows_between(
+    pairs: Rows, others: Rows, ahead: Int[Array, " B"], key: Key[Array, ""]
+) -> tuple[Int[Array, " B"], Int[Array, " B"]]:
+    """Return lane and position of a state between each transition's state and its goal.
+
+    Uniform over the way of the episode where that leads to the goal, else the drawn ``others``.
+    """
+    bits = jax.random.bits(jax.random.fold_in(key, 1), ahead.shape)
+    inside = ahead < FAR
+    position = jnp.where(inside, pairs.position + below(bits, ahead), others.position)
+    return jnp.where(inside, pairs.lane, others.lane), position
+
+
+def steps_ahead(left: Int[Array, " B"], discount: float, key: Key[Array, ""]) -> Int[Array, " B"]:
+    """Return how far ahead the future goals lie, from 1 to the steps that are left.
+
+    Uniform for a discount of 1, else P(k) ∝ discount^k: the discounted distribution over future
+    states, cut off where the episode ends.
+    """
+    if discount == 1:
+        return 1 + below(jax.random.bits(key, left.shape), left)
+    uniform = jax.random.uniform(key, left.shape)
+    kept = 1 - discount ** left.astype(jnp.float32)
+    ahead = jnp.floor(jnp.log1p(-uniform * kept) / jnp.log(discount)).astype(jnp.int32)
+    return 1 + jnp.clip(ahead, 0, jnp.maximum(left, 1) - 1)

@@ -1,6 +1,6 @@
-"""Learning curves: success over environment steps and over training time."""
+"""Learning curves: success and distances over environment steps and over training time."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -9,15 +9,22 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from midway.envs.push import GOAL_THRESHOLD
+from midway.envs.views import TableView
 from midway.reports import style
-from midway.reports.runs import Group, Table
+from midway.reports.cache import Cache
+from midway.reports.runs import Group, Runs
 from midway.reports.statistics import Curve, Run, curve
+from midway.reports.style import Picture, thousands
+from midway.tables import Table
 
 Column: TypeAlias = np.ndarray[Any, np.dtype[np.float64]]
 
 TASKS = {"hard": "hard task", "uniform": "uniform tasks"}
 LINES = {"mean": "-", "sampled": (0, (2, 1.5))}
-"""Solid lines for mean actions, dashed ones for sampled actions."""
+"""Solid lines for the deterministic policy, dashed ones for sampled actions."""
+
+NAMES = {"mean": "deterministic policy", "sampled": "sampled actions"}
 
 NAME_LINES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1)))
 """Lines of several distances of one run."""
@@ -32,13 +39,59 @@ TIME_POINTS = 100
 """Points at which runs of different speeds are compared over time."""
 
 
-def draw(groups: Sequence[Group]) -> Figure:
+def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
+    """Yield success, and the distances that evaluations tell apart."""
+    if not any(run.evaluation for group in runs.groups for run in group.runs):
+        cache.note("no run has been evaluated: no learning curves")
+        return
+    yield Picture(
+        f"{runs.slug}-learning-curves",
+        lambda: draw(runs),
+        "Learning curves",
+        "Success over environment steps (top) and over the time spent on collection and updates, "
+        "without evaluations (bottom). Lines: one seed, or the interquartile mean of several; "
+        "shaded: its 95 % bootstrap interval. Over time, seeds are compared along straight lines "
+        "between their evaluations, and a seed that is done keeps its last success.",
+        f"Learning curves on {runs.env}. Last success: "
+        + "; ".join(
+            f"{group.label} hard {success_text(group, 'hard')}, "
+            f"uniform {success_text(group, 'uniform')}"
+            for group in runs.groups
+        ),
+    )
+    names = distances(runs)
+    if names:
+        yield Picture(
+            f"{runs.slug}-distances",
+            lambda: draw_distances(runs),
+            f"Distance to the goal: {' and '.join(names)}",
+            "Mean distance at the end of the evaluations' episodes of the deterministic policy, "
+            "each by itself; an episode succeeds where all are below their threshold at once.",
+            f"Distance of {' and '.join(names)} to their goals over environment steps, by task.",
+        )
+
+
+def overview(environments: Sequence[Runs]) -> Iterator[Picture]:
+    """Yield success in all environments, where there are several."""
+    if len(environments) > 1:
+        yield Picture(
+            "all-learning-curves",
+            lambda: draw_overview(environments),
+            "All environments",
+            "Success of the deterministic policy over environment steps, interquartile mean over "
+            "seeds with stratified 95 % bootstrap intervals; all environments together where they "
+            "have the same agents.",
+            "Learning curves of every environment.",
+        )
+
+
+def draw(runs: Runs) -> Figure:
     """Draw success on both tasks (columns) over steps and over minutes (rows)."""
     figure, axes = style.figure(2, 2, height=6.2, sharey=True)
     for row, clock in enumerate(("step", "minutes")):
         for column, (task, title) in enumerate(TASKS.items()):
             panel = axes[2 * row + column]
-            for group in groups:
+            for group in runs.groups:
                 for actions in LINES:
                     _draw_group(panel, group, task, actions, clock)
             x = "environment steps" if clock == "step" else "training time (minutes)"
@@ -47,12 +100,13 @@ def draw(groups: Sequence[Group]) -> Figure:
             panel.set_xlim(left=0)
             if clock == "step":
                 panel.xaxis.set_major_formatter(thousands)
-    style.legend_below(figure, _legend(groups))
+    kinds = [_line(style.MUTED, NAMES[actions], line) for actions, line in LINES.items()]
+    style.legend_below(figure, _group_entries(runs.groups) + kinds)
     return figure
 
 
-def draw_overview(environments: Mapping[str, Sequence[Group]]) -> Figure:
-    """Draw success of mean actions over steps: tasks in rows, environments in columns.
+def draw_overview(environments: Sequence[Runs]) -> Figure:
+    """Draw success of the deterministic policy over steps: tasks in rows, environments in columns.
 
     The last column is all environments together, for labels that every environment has.
     """
@@ -61,10 +115,10 @@ def draw_overview(environments: Mapping[str, Sequence[Group]]) -> Figure:
     figure, axes = style.figure(len(TASKS), columns, height=5.2, sharey=True)
     for row, (task, title) in enumerate(TASKS.items()):
         panels = axes[row * columns : (row + 1) * columns]
-        for panel, (env, groups) in zip(panels, environments.items(), strict=False):
-            for group in groups:
+        for panel, runs in zip(panels, environments, strict=False):
+            for group in runs.groups:
                 _draw_group(panel, group, task, "mean", "step")
-            style.label(panel, env if row == 0 else "", "steps", f"success, {title}")
+            style.label(panel, runs.env if row == 0 else "", "steps", f"success, {title}")
         for group, drawn in together[task]:
             _draw_curve(panels[-1], group, "mean", drawn)
             style.label(panels[-1], "all together" if row == 0 else "", "steps")
@@ -74,29 +128,19 @@ def draw_overview(environments: Mapping[str, Sequence[Group]]) -> Figure:
         panel.xaxis.set_major_locator(MaxNLocator(4))
         panel.xaxis.set_major_formatter(thousands)
         panel.label_outer()
-    groups_of_labels = {g.label: g for groups in environments.values() for g in groups}
+    groups_of_labels = {g.label: g for runs in environments for g in runs.groups}
     style.legend_below(figure, _group_entries(list(groups_of_labels.values())))
     return figure
 
 
-def _together(
-    environments: Mapping[str, Sequence[Group]], task: str
-) -> Iterator[tuple[Group, Curve]]:
+def _together(environments: Sequence[Runs], task: str) -> Iterator[tuple[Group, Curve]]:
     """Yield the curve over all environments of every label that all of them have."""
-    for first in next(iter(environments.values())):
-        same = [g for groups in environments.values() for g in groups if g.label == first.label]
+    for first in environments[0].groups:
+        same = [g for runs in environments for g in runs.groups if g.label == first.label]
         strata = [_series(group, task, "mean", "step") for group in same]
         if len(same) == len(environments) and all(strata):
             steps = np.unique(np.concatenate([x for runs in strata for x, _ in runs]))
             yield first, curve(strata, steps)
-
-
-def thousands(value: float | int, position: object = None) -> str:
-    """Return a number of steps in short: 8k, 1.5M."""
-    for size, letter in ((1e6, "M"), (1e3, "k")):
-        if abs(value) >= size:
-            return f"{value / size:g}{letter}"
-    return f"{value:g}"
 
 
 def success_curve(group: Group, task: str, actions: str, clock: str) -> Curve | None:
@@ -108,33 +152,47 @@ def success_curve(group: Group, task: str, actions: str, clock: str) -> Curve | 
     return _curve(_series(group, task, actions, clock), clock)
 
 
-def distances(group: Group) -> list[str]:
-    """Return names of distances that evaluations of the group tell apart, such as ``hand``."""
-    columns = dict.fromkeys(name for run in group.runs for name in run.evaluation)
+def success_text(group: Group, task: str, actions: str = "mean") -> str:
+    """Return the success at the last step that every evaluated run has, with its interval."""
+    drawn = success_curve(group, task, actions, "step")
+    if drawn is None or not len(drawn.x):
+        return "not evaluated"
+    last = int((drawn.runs == drawn.runs.max()).nonzero()[0][-1])
+    text = style.percent(drawn.centre[last])
+    if drawn.runs[last] > 1:
+        low, high = (style.percent(end[last]) for end in drawn.interval)
+        text += f" [{low}, {high}]"
+    return text
+
+
+def distances(runs: Runs) -> list[str]:
+    """Return names of distances that evaluations tell apart, such as ``hand``."""
+    tables = [run.evaluation for group in runs.groups for run in group.runs]
+    columns = dict.fromkeys(name for table in tables for name in table)
     return [name.removeprefix(DISTANCE) for name in columns if name.startswith(DISTANCE)]
 
 
-def draw_distances(groups: Sequence[Group], threshold: float) -> Figure:
+def draw_distances(runs: Runs) -> Figure:
     """Draw each named distance to the goal at the end of episodes, over steps, by task."""
-    names = list(dict.fromkeys(name for group in groups for name in distances(group)))
+    lines = dict(zip(distances(runs), NAME_LINES, strict=False))
+    entries = [_line(style.MUTED, name, line) for name, line in lines.items()]
     figure, axes = style.figure(1, len(TASKS), height=3.6, sharey=True)
     for panel, (task, title) in zip(axes, TASKS.items(), strict=True):
-        for group in groups:
-            for name, line in zip(names, NAME_LINES, strict=False):
+        for group in runs.groups:
+            for name, line in lines.items():
                 series = _series(group, task, "mean", "step", DISTANCE + name)
                 if (drawn := _curve(series, "step")) is not None:
                     _draw_curve(panel, group, "mean", drawn, line)
-        panel.axhline(threshold, color=style.MUTED, linestyle=":", linewidth=1.4)
         style.label(panel, f"Distance at the end, {title}", "environment steps", "m")
         panel.set_ylim(bottom=0)
         panel.set_xlim(left=0)
         panel.xaxis.set_major_formatter(thousands)
-    lines = [
-        Line2D([], [], color=style.MUTED, linewidth=2, linestyle=line, label=name)
-        for name, line in zip(names, NAME_LINES, strict=False)
-    ]
-    near = Line2D([], [], color=style.MUTED, linestyle=":", label="near enough")
-    style.legend_below(figure, [*_group_entries(groups), *lines, near])
+    if isinstance(runs.view, TableView):
+        look: dict[str, Any] = {"color": style.MUTED, "linestyle": ":", "linewidth": 1.4}
+        for panel in axes:
+            panel.axhline(GOAL_THRESHOLD, **look)
+        entries.append(Line2D([], [], label="near enough", **look))
+    style.legend_below(figure, [*_group_entries(runs.groups), *entries])
     return figure
 
 
@@ -180,7 +238,7 @@ def _draw_group(axes: Axes, group: Group, task: str, actions: str, clock: str) -
 
 
 def _draw_curve(axes: Axes, group: Group, actions: str, drawn: Curve, line: Any = None) -> None:
-    """Draw the line; for mean actions also marks, and the interval of several runs."""
+    """Draw the line; for the deterministic policy also marks, and the interval of several runs."""
     axes.plot(
         drawn.x,
         drawn.centre,
@@ -196,29 +254,13 @@ def _draw_curve(axes: Axes, group: Group, actions: str, drawn: Curve, line: Any 
         axes.fill_between(drawn.x, band.low, band.high, color=group.colour, alpha=0.18, lw=0)
 
 
-def _legend(groups: Sequence[Group]) -> list[Line2D]:
-    kinds = [
-        Line2D([], [], color=style.MUTED, linewidth=2, linestyle=line, label=f"{actions} actions")
-        for actions, line in LINES.items()
-    ]
-    return _group_entries(groups) + kinds
-
-
 def _group_entries(groups: Sequence[Group]) -> list[Line2D]:
     return [
-        Line2D(
-            [],
-            [],
-            color=group.colour,
-            linewidth=2,
-            marker=group.marker,
-            markersize=5,
-            label=f"{group.label} ({seeds(group)})",
-        )
+        _line(group.colour, f"{group.label} ({group.seeds})", marker=group.marker, markersize=5)
         for group in groups
     ]
 
 
-def seeds(group: Group) -> str:
-    """Return how many runs there are, in words."""
-    return "1 seed" if len(group.runs) == 1 else f"{len(group.runs)} seeds"
+def _line(colour: str, label: str, line: Any = "-", **look: Any) -> Line2D:
+    """Return an entry of a legend."""
+    return Line2D([], [], color=colour, linewidth=2, linestyle=line, label=label, **look)

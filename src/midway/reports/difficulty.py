@@ -1,6 +1,6 @@
 """Success against difficulty: the length of the shortest path, and the numbered cases."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -9,10 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from midway.envs.views import MazeView
 from midway.reports import style
-from midway.reports.runs import Group
+from midway.reports.cache import Cache, Episode
+from midway.reports.runs import Group, Runs
 from midway.reports.statistics import bootstrap, interquartile_mean, wilson
-from midway.reports.study import Episode
+from midway.reports.style import Picture
 
 BINS = 6
 """Bins of geodesic distance."""
@@ -21,6 +23,30 @@ TASKS = ("uniform", "hard")
 
 Seeds: TypeAlias = list[list[Episode]]
 """Episodes of each seed; starts and goals are the same for every seed."""
+
+
+def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
+    """Yield one figure of all groups with policies, in a maze."""
+    if not isinstance(runs.view, MazeView):
+        return
+    results = {
+        group.label: (group, [study.episodes() for study in studies])
+        for group in runs.groups
+        if (studies := cache.studies(group))
+    }
+    if not results:
+        return
+    cases = [name for name in runs.view.maze.cases if name.startswith("case-")]
+    yield Picture(
+        f"{runs.slug}-difficulty",
+        lambda: draw(results, cases),
+        "Success against difficulty",
+        "The saved deterministic policies, with the same starts and goals for all. Each bin of "
+        "uniform tasks holds as many episodes. Bars: 95 % intervals, over seeds by bootstrap; of "
+        "a single seed over its episodes (Wilson).",
+        f"Success on {runs.env} by length of the shortest path"
+        + (" and by numbered case." if cases else "."),
+    )
 
 
 def draw(results: Mapping[str, tuple[Group, Seeds]], cases: Sequence[str]) -> Figure:

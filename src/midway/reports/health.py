@@ -1,7 +1,7 @@
 """Training health: the scalars of ``metrics.csv``, and what a healthy curve looks like."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,8 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from midway.reports import style
-from midway.reports.curves import seeds, thousands
-from midway.reports.runs import Group, RunData, Table
+from midway.reports.cache import Cache
+from midway.reports.runs import Group, RunData, Runs
+from midway.reports.style import Picture, thousands
+from midway.tables import Table
 
 COLUMNS = 3
 
@@ -104,27 +106,49 @@ PANELS = (
 )
 
 
+def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
+    """Yield one figure of all scalars that some run has."""
+    shown = panels(runs.groups)
+    if not shown:
+        cache.note("no run has metrics yet: no training health")
+        return
+    yield Picture(
+        f"{runs.slug}-health",
+        lambda: draw(runs.groups),
+        "Training health",
+        "One line for each seed; the grey text says what a healthy curve looks like. "
+        "Dotted: the bounds of the values.",
+        f"{len(shown)} quantities over environment steps: "
+        f"{', '.join(panel.title for panel in shown)}. Healthy: "
+        + " ".join(panel.healthy for panel in shown),
+    )
+
+
 def draw(groups: Sequence[Group]) -> Figure:
     """Draw every quantity that some run has, one line per run."""
     shown = panels(groups)
     rows = -(-len(shown) // COLUMNS)
     figure, axes = style.figure(rows, COLUMNS, height=2.75 * rows + 0.4)
     for axis, panel in zip(axes, shown, strict=False):
-        for group in groups:
-            for run in group.runs:
-                _draw_run(axis, panel, group, run)
-        if panel.bounded:
-            _draw_bounds(axis, groups)
-        if panel.logarithmic:
-            _scale_logarithmically(axis)
-        axis.xaxis.set_major_formatter(thousands)
-        axis.set_xlim(left=0)
-        _write(axis, panel)
+        _draw_panel(axis, panel, groups)
     for axis in axes[len(shown) :]:
         axis.set_visible(False)
     entries = [_entry(group) for group in groups]
     style.legend_below(figure, entries, title="x axis of every panel: environment steps")
     return figure
+
+
+def _draw_panel(axes: Axes, panel: Panel, groups: Sequence[Group]) -> None:
+    for group in groups:
+        for run in group.runs:
+            _draw_run(axes, panel, group, run)
+    if panel.bounded:
+        _draw_bounds(axes, groups)
+    if panel.logarithmic:
+        _scale_logarithmically(axes)
+    axes.xaxis.set_major_formatter(thousands)
+    axes.set_xlim(left=0)
+    _write(axes, panel)
 
 
 def panels(groups: Sequence[Group]) -> list[Panel]:
@@ -192,4 +216,4 @@ def _write(axes: Axes, panel: Panel) -> None:
 
 
 def _entry(group: Group) -> Any:
-    return Line2D([], [], color=group.colour, linewidth=2, label=f"{group.label} ({seeds(group)})")
+    return Line2D([], [], color=group.colour, linewidth=2, label=f"{group.label} ({group.seeds})")

@@ -1,6 +1,6 @@
 """Imagined subgoals during training, the subgoal chain, and the value of a goal."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,10 +11,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from midway.envs.mazes import Maze
-from midway.reports import maps, style
-from midway.reports.curves import thousands
-from midway.reports.runs import Row, Table, row
-from midway.reports.study import Study, grid
+from midway.envs.views import MazeView
+from midway.reports import maze as maps
+from midway.reports import style
+from midway.reports.cache import Cache, Study, grid
+from midway.reports.runs import Group, Row, Runs, row
+from midway.reports.style import Picture, thousands
+from midway.tables import Table
 
 HEAT = LinearSegmentedColormap.from_list(
     "heat", [(0.90, 0.62, 0.0, 0.0), (0.90, 0.62, 0.0, 0.75), (0.84, 0.37, 0.0, 0.95)]
@@ -33,16 +36,61 @@ HEAT_POINTS = 200
 """Points along each side of a heat map."""
 
 
+def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
+    """Yield the subgoals of each group that imagines any, and the values of each unit."""
+    if not isinstance(runs.view, MazeView):
+        return
+    firsts = [(group, study) for group in runs.groups for study in cache.studies(group)[:1]]
+    for group, study in firsts:
+        if study.imagines:
+            yield _subgoal_picture(runs, cache, group, study)
+    for unit in dict.fromkeys(study.value_unit for _, study in firsts):
+        if unit is not None:
+            alike = [(group, study) for group, study in firsts if study.value_unit == unit]
+            yield _value_picture(runs, unit, alike)
+
+
+def _subgoal_picture(runs: Runs, cache: Cache, group: Group, study: Study) -> Picture:
+    count = len(study.subgoals()["step"])
+    if count == 1:
+        cache.note(
+            f"{group.label}, seed {study.run.config.seed}: no past policies were kept, so "
+            "imagined subgoals are shown at the last step only"
+        )
+    return Picture(
+        f"{runs.slug}-{group.slug}-subgoals",
+        lambda: draw_subgoals(study, group.label),
+        f"What {group.label} imagines",
+        f"Where the subgoal policy puts subgoals of the hard task ({study.where}), and the chain "
+        "that comes from imagining again between start, subgoals and goal: the largest mark is "
+        "the first subgoal, smaller ones halve what is left.",
+        f"Heat map of imagined subgoals at {count} snapshots of training, and the subgoal chain.",
+    )
+
+
+def _value_picture(runs: Runs, unit: str, studies: Sequence[tuple[Group, Study]]) -> Picture:
+    labels = {group.label: study for group, study in studies}
+    return Picture(
+        f"{runs.slug}-{'-'.join(group.slug for group, _ in studies)}-values",
+        lambda: draw_values(labels, unit),
+        f"Value of a goal: {', '.join(labels)}",
+        "Value of every place for the goal of the hard task, from which the agent starts at rest. "
+        "Bright: near by its own reckoning; a sound value follows the corridors, not the straight "
+        "line.",
+        f"Map of {unit} for {', '.join(labels)} on {runs.env}.",
+    )
+
+
 def draw_subgoals(study: Study, label: str) -> Figure:
-    """Draw where subgoals of the hard task are imagined at moments of training, and the chain."""
+    """Draw where subgoals of the hard task are imagined at snapshots of training, and the chain."""
     table = study.subgoals()
-    moments = [row(table, place) for place in range(len(table["step"]))]
-    figure, axes = maps.panels(study.maze, len(moments) + 1)
-    for panel, moment in zip(axes, moments, strict=False):
-        _draw_heat(panel, study.maze, moment)
-        style.caption(panel, label, f"step {thousands(moment['step'])}")
-    _draw_chain(axes[-1], moments[-1], study.chain())
-    style.caption(axes[-1], "subgoal chain", f"step {thousands(moments[-1]['step'])}")
+    snapshots = [row(table, place) for place in range(len(table["step"]))]
+    figure, axes = maps.panels(study.maze, len(snapshots) + 1)
+    for panel, snapshot in zip(axes, snapshots, strict=False):
+        _draw_heat(panel, study.maze, snapshot)
+        style.caption(panel, label, f"step {thousands(snapshot['step'])}")
+    _draw_chain(axes[-1], snapshots[-1], study.chain())
+    style.caption(axes[-1], "subgoal chain", f"step {thousands(snapshots[-1]['step'])}")
     style.legend_below(figure, _legend())
     return figure
 
@@ -115,17 +163,17 @@ def draw_values(studies: Mapping[str, Study], unit: str) -> Figure:
     """Draw the value of the hard task's goal from everywhere in the maze, one map per label."""
     tables = {label: study.values() for label, study in studies.items()}
     lowest = min(float(table["value"].min()) for table in tables.values())
-    maze = next(iter(studies.values())).maze
-    figure, axes = maps.panels(maze, len(studies), side=1.2)
-    x, y = grid(maze)
+    highest = max(float(table["value"].max()) for table in tables.values())
+    first = next(iter(studies.values()))
+    figure, axes = maps.panels(first.maze, len(studies), side=1.2)
+    x, y = grid(first.maze)
+    # Values that count down to the goal end at 0.
+    colours = {"cmap": "viridis", "vmin": lowest, "vmax": highest if highest > 0 else 0}
     image: Any = None
     for panel, (label, study) in zip(axes, studies.items(), strict=True):
         shades = tables[label]["value"].reshape(len(y), len(x))
-        colours = {"cmap": "viridis", "vmin": lowest, "vmax": 0, "zorder": 1}
-        image = show_image(panel, maze, shades, x, y, **colours)
-        case = maze.cases["hard"]
-        start, goal = (np.array([box.x, box.y]) for box in (case.start, case.goal))
-        maps.draw_ends(panel, start, goal)
+        image = show_image(panel, first.maze, shades, x, y, **colours, zorder=1)
+        maps.draw_ends(panel, *first.ends())
         style.caption(panel, label, f"step {thousands(study.run.policy_step)}")
     bar = figure.colorbar(image, ax=axes, shrink=0.8, fraction=0.06)
     bar.set_label(unit, fontsize=style.TEXT, color=style.INK)

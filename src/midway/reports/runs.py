@@ -1,6 +1,5 @@
 """What run folders hold, read for figures."""
 
-import csv
 import dataclasses
 from collections import Counter
 from collections.abc import Sequence
@@ -9,22 +8,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
-
+from midway import tables
+from midway.agent import AnyAgent
+from midway.agents import registry as agents
+from midway.envs import registry as environments
+from midway.envs.views import View
 from midway.reports import style
-from midway.training.folder import RunConfig, RunFolder, read_json
+from midway.runs.folder import RunConfig, RunFolder, read_json, run_name
+from midway.tables import Table
 from midway.types import ConfigurationError
-
-Table: TypeAlias = dict[str, np.ndarray[Any, np.dtype[Any]]]
-"""Columns by name: float64, or text for the columns of ``TEXT_COLUMNS``."""
 
 Row: TypeAlias = dict[str, float]
 """One row of numbers by column."""
 
 WATCHING = ("steps", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every")
 """Settings that a run does not learn from."""
-
-TEXT_COLUMNS = ("task", "actions")
 
 
 @dataclass(frozen=True)
@@ -81,8 +79,20 @@ class RunData:
 
     @property
     def name(self) -> str:
-        """The run in file names and lists."""
-        return f"{self.config.env}-{self.config.agent}-seed{self.config.seed}"
+        """The run in file names."""
+        return style.file_name(run_name(self.config.env, self.config.agent, self.config.seed))
+
+    @property
+    def agent(self) -> AnyAgent:
+        """The agent, which says what it is able to."""
+        return agents.get(self.config.agent)
+
+    @property
+    def view(self) -> View | None:
+        """How the environment is drawn; None if nobody knows."""
+        with suppress(ConfigurationError):  # its package may be missing here
+            return environments.entry(self.config.env).view
+        return None
 
     def evaluated(self, task: str, actions: str) -> Table:
         """Return the evaluations of one task with one kind of action."""
@@ -111,9 +121,32 @@ class Group:
     runs: tuple[RunData, ...]
 
     @property
-    def agent(self) -> str:
-        """Name of the agent."""
-        return self.runs[0].config.agent
+    def seeds(self) -> str:
+        """How many runs there are, in words."""
+        return "1 seed" if len(self.runs) == 1 else f"{len(self.runs)} seeds"
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Runs in one environment.
+
+    Attributes:
+        env: Name of the environment.
+        groups: The runs, in groups.
+    """
+
+    env: str
+    groups: Sequence[Group]
+
+    @property
+    def slug(self) -> str:
+        """The environment in file names."""
+        return style.file_name(self.env)
+
+    @property
+    def view(self) -> View | None:
+        """How the environment is drawn; None if nobody knows."""
+        return self.groups[0].runs[0].view
 
 
 def read(path: Path) -> RunData:
@@ -129,37 +162,9 @@ def read(path: Path) -> RunData:
         folder,
         config,
         record,
-        read_table(folder.metrics_file),
-        read_table(folder.evaluation_file),
+        tables.read(folder.metrics_file),
+        tables.read(folder.evaluation_file),
     )
-
-
-def read_table(path: Path) -> Table:
-    """Return the columns of a CSV file; none if it is not there or has no rows.
-
-    A last line that is being written while we read is left out.
-
-    Raises:
-        ConfigurationError: The file holds something else.
-    """
-    if not path.exists():
-        return {}
-    try:
-        with path.open(newline="") as file:
-            header, *rows = list(csv.reader(file)) or [[]]
-        whole = [row for row in rows if len(row) == len(header)]
-        columns = dict(zip(header, zip(*whole, strict=True), strict=False))
-        return {
-            name: np.array(values) if name in TEXT_COLUMNS else _numbers(values)
-            for name, values in columns.items()
-        }
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"{path} cannot be read: {error}") from error
-
-
-def _numbers(values: Sequence[str]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return numbers; NaN where a row has none."""
-    return np.array([value or "nan" for value in values], np.float64)
 
 
 def row(table: Table, place: int) -> Row:
@@ -167,37 +172,73 @@ def row(table: Table, place: int) -> Row:
     return {name: float(column[place]) for name, column in table.items()}
 
 
+def by_environment(runs: Sequence[RunData]) -> list[Runs]:
+    """Return the runs of every environment, in the order of the registry and then by name."""
+    known = list(environments.ENVIRONMENTS)
+    names = {run.config.env for run in runs}
+    ordered = sorted(names, key=lambda name: (name not in known, *_place(known, name), name))
+    return [Runs(name, groups([run for run in runs if run.config.env == name])) for name in ordered]
+
+
 def groups(runs: Sequence[RunData]) -> list[Group]:
     """Return runs of one environment, grouped by all that they learn from but the seed."""
     by_settings: dict[str, list[RunData]] = {}
     for run in runs:
         by_settings.setdefault(repr(_settings(run.config)), []).append(run)
-    gathered = sorted(by_settings.values(), key=lambda group: _order(group[0].config.agent))
-    colours = iter(style.SPARE_COLOURS * len(gathered))
-    counts: Counter[str] = Counter()
-    found: list[Group] = []
-    for number, members in enumerate(gathered):
-        agent = members[0].config.agent
-        rivals = [other[0].config for other in gathered if other[0].config.agent == agent]
-        counts[agent] += 1
-        first = counts[agent] == 1
-        colour = style.AGENT_COLOURS.get(agent) if first else None
-        found.append(
-            Group(
-                slug=agent if first else f"{agent}-{counts[agent]}",
-                label=", ".join([agent.upper(), *_differences(members[0].config, rivals)]),
-                colour=colour or next(colours),
-                marker=style.MARKERS[number % len(style.MARKERS)],
-                runs=tuple(sorted(members, key=lambda run: run.config.seed)),
-            )
+    known = list(style.AGENT_COLOURS)
+    gathered = sorted(by_settings.values(), key=lambda group: _place(known, group[0].config.agent))
+    agents = [members[0].config.agent for members in gathered]
+    names = agent_labels(agents)
+    slugs = _slugs([style.file_name(name.lower()) for name in names])
+    # Only the first group of an agent has the agent's own colour.
+    firsts = [agent not in agents[:place] for place, agent in enumerate(agents)]
+    own = [style.AGENT_COLOURS.get(a) if f else None for a, f in zip(agents, firsts, strict=True)]
+    colours = style.colours(own)
+    return [
+        Group(
+            slug=slug,
+            label=", ".join([name, *_differences(members[0].config, gathered)]),
+            colour=colour,
+            marker=style.MARKERS[number % len(style.MARKERS)],
+            runs=tuple(sorted(members, key=lambda run: str(run.config.seed).zfill(12))),
         )
+        for number, (slug, name, colour, members) in enumerate(
+            zip(slugs, names, colours, gathered, strict=True)
+        )
+    ]
+
+
+def agent_labels(agents: Sequence[str]) -> list[str]:
+    """Return the names of agents in legends: ``RIS`` of ``ris``.
+
+    An agent from outside, ``package.module:NAME``, goes by NAME, or by its module where that is
+    ``AGENT``; by all of it where two would be called the same.
+    """
+    short = {agent: _agent_label(agent) for agent in agents}
+    counts = Counter(short.values())
+    return [short[agent] if counts[short[agent]] == 1 else agent for agent in agents]
+
+
+def _agent_label(agent: str) -> str:
+    module, _, name = agent.partition(":")
+    if not name:
+        return agent.upper()
+    return module.rpartition(".")[2] if name.lower() == "agent" else name
+
+
+def _slugs(names: Sequence[str]) -> list[str]:
+    """Return names for files, numbered from the second of a name on."""
+    counts: Counter[str] = Counter()
+    found = []
+    for name in names:
+        counts[name] += 1
+        found.append(name if counts[name] == 1 else f"{name}-{counts[name]}")
     return found
 
 
-def _order(agent: str) -> int:
-    """Return the place of an agent in legends."""
-    known = list(style.AGENT_COLOURS)
-    return known.index(agent) if agent in known else len(known)
+def _place(known: Sequence[str], name: str) -> tuple[int, str]:
+    """Return what sorts names: those that are known first, in their order."""
+    return (known.index(name), "") if name in known else (len(known), name)
 
 
 def _settings(config: RunConfig) -> dict[str, Any]:
@@ -208,8 +249,9 @@ def _settings(config: RunConfig) -> dict[str, Any]:
     return {"agent": config.agent, "preset": config.preset, **values}
 
 
-def _differences(config: RunConfig, rivals: Sequence[RunConfig]) -> list[str]:
+def _differences(config: RunConfig, gathered: Sequence[Sequence[RunData]]) -> list[str]:
     """Return the settings of this group that differ from another group of the same agent."""
     mine = _settings(config)
-    others = [_settings(rival) for rival in rivals]
+    rivals = [members[0].config for members in gathered]
+    others = [_settings(rival) for rival in rivals if rival.agent == config.agent]
     return [f"{name} {mine[name]}" for name in mine if any(o[name] != mine[name] for o in others)]

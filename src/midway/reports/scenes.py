@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from midway.envs.mazes import Maze
-from midway.reports import imagination, maps, strips, style, tabletop
-from midway.reports.rollouts import Recording
-from midway.reports.strips import Images
-from midway.reports.study import POSITION, maze_of
-from midway.training import decoder as decoders
-from midway.training.folder import RunFolder
-from midway.training.policy import Policy
+from midway.envs import registry as environments
+from midway.envs.views import MazeView, TableView
+from midway.reports import decoder, style, tabletop
+from midway.reports import maze as maps
+from midway.reports.decoder import Images
+from midway.reports.recordings import Recording, imagined, in_every_state, plans
+from midway.runs.folder import RunFolder
+from midway.runs.policy import Policy
 from midway.types import ConfigurationError
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
@@ -56,16 +56,15 @@ def maker(folder: RunFolder, policy: Policy, title: str) -> MakeScene:
     Raises:
         ConfigurationError: There is no scene of the policy's environment.
     """
-    env = policy.config.env
-    maze = maze_of(env)
-    if maze is not None:
-        return lambda recording: MazeScene(maze, title, policy, recording)
-    if policy.state.spec.is_image:
+    view = environments.entry(policy.config.env).view
+    if isinstance(view, MazeView):
+        return lambda recording: MazeScene(view, title, policy, recording)
+    if isinstance(view, TableView) and policy.spec.is_image:
         decode = decoding(folder, policy)
         return lambda recording: ImageScene(title, policy, recording, decode)
-    if tabletop.has_table(env):
+    if isinstance(view, TableView):
         return lambda recording: TableScene(title, policy, recording)
-    raise ConfigurationError(f"{env}: videos are made of mazes and of push only")
+    raise ConfigurationError(f"{policy.config.env} has no view, so no videos are made of it")
 
 
 class Stage:
@@ -82,6 +81,7 @@ class Stage:
         for artist in moving:
             artist.set_animated(True)
         figure.set_dpi(PIXELS)
+        style.settle(figure)
         self._canvas = cast(Any, figure.canvas)
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(figure.bbox)
@@ -100,20 +100,21 @@ class MazeScene:
     """A maze from above, with the agent, its trail, its goal and the subgoals it imagines.
 
     Args:
-        maze: The maze.
+        view: The maze, and where positions are.
         title: What is shown.
         policy: The policy, asked for subgoals in every state if it imagines any.
         recording: The episode.
     """
 
-    def __init__(self, maze: Maze, title: str, policy: Policy, recording: Recording) -> None:
-        self._path = recording.achieved[:, POSITION]
-        self._subgoals = tabletop.in_every_state(policy, recording)
-        self._kind = kind_of(recording)
+    def __init__(self, view: MazeView, title: str, policy: Policy, recording: Recording) -> None:
+        self._path = recording.states[:, view.position]
+        found = in_every_state(policy, recording)
+        self._subgoals = None if found is None else found[..., view.position]
+        self._kind = recording.kind
         self._words = Words(policy, recording, unit=1.0)
-        figure, (axes,) = maps.panels(maze, 1)
+        figure, (axes,) = maps.panels(view.maze, 1)
         _head(axes, title)
-        maps.draw_ends(axes, self._path[0], recording.goal[POSITION], size=1.4)
+        maps.draw_ends(axes, self._path[0], recording.target[view.position], size=1.4)
         self._trail, self._agent, self._marks = (
             axes.plot([], [], **look)[0]
             for look in (
@@ -131,7 +132,7 @@ class MazeScene:
         self._trail.set_data(*self._path[: step + 1].T)
         self._agent.set_data(*self._path[step : step + 1].T)
         if self._subgoals is not None:
-            self._marks.set_data(*self._subgoals[step][:, POSITION].T)
+            self._marks.set_data(*self._subgoals[step].T)
         self._text.set_text(self._words.after(step))
         return self._stage.frame()
 
@@ -155,7 +156,7 @@ class TableScene:
     def __init__(self, title: str, policy: Policy, recording: Recording) -> None:
         self._states = recording.states
         self._subgoals = tabletop.subgoals(policy, recording)
-        self._kind = kind_of(recording)
+        self._kind = recording.kind
         self._words = Words(policy, recording, unit=0.01)
         figure, (axes,) = tabletop.panels(1, 1, TABLE_WIDTH)
         _head(axes, title)
@@ -226,7 +227,7 @@ class ImageScene:
     ) -> None:
         subgoals = decode(recording)
         films = {"now": recording.observations}
-        films |= {} if subgoals is None else {f"{kind_of(recording)} subgoal": subgoals}
+        films |= {} if subgoals is None else {f"{recording.kind} subgoal": subgoals}
         self._films = list(films.values())
         self._words = Words(policy, recording, unit=0.01)
         columns = len(films) + 1
@@ -262,7 +263,7 @@ class Words:
     """
 
     def __init__(self, policy: Policy, recording: Recording, unit: float) -> None:
-        task: Any = policy.state.spec.task
+        task: Any = policy.spec.task
         pair = recording.states, recording.target
         named = task.named_distances(*pair) if getattr(task, "names", ()) else {}
         self._distances = named or {"": task.distance(*pair)}
@@ -282,37 +283,35 @@ class Words:
         return f"step {step}, {', '.join(parts)} to the goal"
 
 
-def kind_of(recording: Recording) -> str:
-    """Return what the subgoals of an episode are, if there are any."""
-    return "imagined" if recording.plans is None else "planned"
-
-
 def decoding(folder: RunFolder, policy: Policy) -> Callable[[Recording], Images | None]:
     """Return what gives the subgoal in every state as an image; it returns None without any.
 
-    It is the mean of those imagined (RIS), or the one planned for the running segment (LEAP).
+    It is the mean of those imagined, or the planned one that is due.
     """
-    if imagination.plans(policy.config.agent):
-        return lambda recording: strips.decoded(policy.state.vae.decode, _aims(policy, recording))
-    if not (imagination.imagines(policy.config.agent) and decoders.has_encoder(policy)):
+    if decoder.encoder_of(policy) is None:
         return lambda recording: None
-    decoder = strips.decoder_of(folder, policy)
+    if not plans(policy.agent) and policy.agent.subgoals is None:
+        return lambda recording: None
+    fitted = decoder.of_policy(folder, policy)
 
     def decode(recording: Recording) -> Images:
-        goals = np.repeat(recording.goal[None], len(recording.observations), axis=0)
-        mean = imagination.distribution(policy, recording.observations, goals)[0]
-        return strips.decoded(decoder, mean)
+        if recording.plans is None:
+            features = np.asarray(imagined(policy, recording).location.achieved_goal)
+        else:
+            features = _aims(recording.plans, policy.spec.max_episode_steps)
+        return decoder.decoded(fitted, features)
 
     return decode
 
 
-def _aims(policy: Policy, recording: Recording) -> Float[np.ndarray, "T L"]:
-    """Return the planned subgoal that is aimed at in every state, as a code; at last the last."""
-    assert recording.plans is not None
-    steps = np.minimum(np.arange(recording.length + 1), recording.length - 1)
-    segment = policy.agent.segment_steps(policy.config.hyperparameters, policy.state.spec)
-    places = np.minimum(steps // segment, recording.plans.shape[1] - 1)
-    return np.asarray(recording.plans[steps, places])
+def _aims(plans: Float[np.ndarray, "T N F"], max_steps: int) -> Float[np.ndarray, "T_1 F"]:
+    """Return the subgoal that is due in every state, and at the end the last of these.
+
+    The subgoals of a plan divide the time of an episode in equal parts.
+    """
+    steps = np.minimum(np.arange(len(plans) + 1), len(plans) - 1)
+    part = -(-max_steps // (plans.shape[1] + 1))
+    return np.asarray(plans[steps, np.minimum(steps // part, plans.shape[1] - 1)])
 
 
 def _head(axes: Axes, title: str) -> None:

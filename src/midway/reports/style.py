@@ -1,7 +1,9 @@
 """How figures look: size, colours, labels. Drawn through matplotlib's objects, without pyplot."""
 
+import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +34,58 @@ BLUE, ORANGE, GREEN, VERMILION = "#0072b2", "#e69f00", "#009e73", "#d55e00"
 PURPLE, SKY, BLACK = "#cc79a7", "#56b4e9", "#000000"
 """The palette of Okabe and Ito, which colour-blind readers can tell apart."""
 
-AGENT_COLOURS = {"ris": BLUE, "sac": VERMILION, "tdm": GREEN, "leap": PURPLE}
-"""The same agent has the same colour in every figure."""
+PALETTE = (BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE, BLACK)
+"""Colours of groups of runs, in the order in which they are given out."""
 
-SPARE_COLOURS = (SKY, ORANGE, BLACK, PURPLE, GREEN)
-"""Colours of further groups of runs of the same agent."""
+AGENT_COLOURS = {"ris": BLUE, "sac": VERMILION, "tdm": GREEN, "leap": PURPLE, "crl": SKY}
+"""An agent that is named here has the same colour in every figure; others get what is left."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 """Marks that tell groups apart without colour."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure with its words.
+
+    Attributes:
+        stem: Its file name without an ending.
+        draw: Draws it.
+        title: Its heading on the page.
+        caption: How to read it.
+        description: What it shows, for those who do not see it.
+    """
+
+    stem: str
+    draw: Callable[[], Figure]
+    title: str
+    caption: str
+    description: str
+
+
+def file_name(text: str) -> str:
+    """Return text as part of a file name: only letters, digits, ``.``, ``_`` and ``-`` stay."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip(".-") or "unnamed"
+
+
+def colours(preferred: Sequence[str | None]) -> list[str]:
+    """Return a colour for each group: the preferred one, or the next that no other group has."""
+    free = [colour for colour in PALETTE if colour not in preferred] or list(PALETTE)
+    rest: Iterator[str] = iter(free * len(preferred))
+    return [colour or next(rest) for colour in preferred]
+
+
+def percent(share: float) -> str:
+    """Return a share as a percentage without decimals."""
+    return f"{100 * share:.0f}\N{NO-BREAK SPACE}%"
+
+
+def thousands(value: float | int, position: object = None) -> str:
+    """Return a number of steps in short: 8k, 1.5M."""
+    for size, letter in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:g}{letter}"
+    return f"{value:g}"
 
 
 def figure(
@@ -99,10 +145,28 @@ def legend_below(drawn: Figure, handles: Sequence[Any], title: str = "") -> None
     )
 
 
+def settle(drawn: Figure) -> None:
+    """Find the places of the panels, once, so that all words are on the canvas.
+
+    A panel of a fixed aspect would be measured while it is smaller than its place, and what is
+    missing around it would be taken for room for titles: it is measured as large as its place.
+    """
+    engine = drawn.get_layout_engine()
+    assert engine is not None
+    aspects = {axes: axes.get_aspect() for axes in drawn.axes}
+    for axes in aspects:
+        axes.set_aspect("auto")
+    engine.execute(drawn)
+    drawn.set_layout_engine("none")
+    for axes, aspect in aspects.items():
+        axes.set_aspect(aspect)
+
+
 def save(drawn: Figure, path: Path) -> list[Path]:
     """Write ``path`` as PNG and as SVG; return both files."""
     files = [path.with_name(path.name + suffix) for suffix in (".png", ".svg")]
+    drawn.set_dpi(RESOLUTION)
+    settle(drawn)
     drawn.savefig(files[0], dpi=RESOLUTION, facecolor="white")
-    drawn.set_layout_engine("none")  # the places of the panels are found; once is enough
     drawn.savefig(files[1], dpi=RESOLUTION, facecolor="white", metadata={"Date": None})
     return files

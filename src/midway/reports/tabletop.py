@@ -1,6 +1,6 @@
 """The table of the arm from above: where a policy brings hand and puck, and what it imagines."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patches import Rectangle as Patch
 
-from midway.envs.push import IMAGE_SPEC, STATE_SPEC
 from midway.envs.push_scene import HAND_BOX
-from midway.reports import imagination, maps, style
-from midway.reports.rollouts import Recording, record
-from midway.training.policy import Policy
+from midway.envs.views import TableView
+from midway.reports import maze as maps
+from midway.reports import style
+from midway.reports.cache import ON_TABLE, Cache, Study
+from midway.reports.recordings import Recording, in_every_state
+from midway.reports.runs import Group, Runs
+from midway.reports.style import Picture
+from midway.runs.policy import Policy
 
-HAND, PUCK = slice(0, 2), slice(2, 4)
+HAND, PUCK = TableView.hand, TableView.puck
 """x and y of the hand and of the puck in a state (m)."""
 
 PUCK_RADIUS = 0.04
@@ -26,38 +30,44 @@ PUCK_RADIUS = 0.04
 MARGIN = 0.06
 """How much is drawn around what the hand can reach (m)."""
 
-COLUMNS = 3
-"""Episodes of each task on a figure."""
 
-TASKS = ("hard", "uniform")
-SUBGOALS = 20
-"""Imagined subgoals that are drawn for a state and a goal."""
-
-
-def has_table(env: str) -> bool:
-    """Return whether the states of an environment are hand x, y and puck x, y."""
-    return env in (STATE_SPEC.name, IMAGE_SPEC.name)
+def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
+    """Yield the table of each group: the policy of its first usable seed."""
+    if isinstance(runs.view, TableView):
+        for group in runs.groups:
+            for study in cache.studies(group)[:1]:
+                yield _picture(runs, group, study)
 
 
-def episodes(policy: Policy, seed: int) -> list[Recording]:
-    """Return the episodes of a figure, the hard ones first."""
-    return record(policy, dict.fromkeys(TASKS, COLUMNS), seed)
+def _picture(runs: Runs, group: Group, study: Study) -> Picture:
+    episodes = study.recordings
+    return Picture(
+        f"{runs.slug}-{group.slug}-table",
+        lambda: draw(study, group.label),
+        f"{group.label} at the table",
+        f"Ways of hand and puck with the deterministic policy ({study.where}), seen as the camera "
+        "sees them. An episode ends when both are within 5 cm of their goals. Subgoals, where they "
+        "are states, are those at the start.",
+        f"Plan of the table with {len(episodes)} episodes of {group.label}, "
+        f"{sum(episode.success for episode in episodes)} of which reach the goal.",
+    )
 
 
-def draw(policy: Policy, recordings: Sequence[Recording], label: str) -> Figure:
+def draw(study: Study, label: str) -> Figure:
     """Draw the ways of hand and puck, and subgoals imagined or planned at the start."""
-    figure, axes = panels(len(TASKS), COLUMNS)
-    for panel, recording in zip(axes, recordings, strict=True):
-        start, goal = recording.states[0], recording.target
+    figure, axes = panels(len(ON_TABLE), max(ON_TABLE.values()))
+    kind = ""
+    for panel, recording in zip(axes, study.recordings, strict=True):
         draw_ways(panel, recording)
-        imagined = subgoals(policy, recording)
-        if imagined is not None:
-            draw_subgoals(panel, imagined[0])
-        draw_state(panel, start, maps.START)
-        draw_state(panel, goal, maps.GOAL)
+        found = subgoals(study.policy, recording)
+        if found is not None:
+            draw_subgoals(panel, found[0])
+            kind = recording.kind
+        draw_state(panel, recording.states[0], maps.START)
+        draw_state(panel, recording.target, maps.GOAL)
         end = "reached" if recording.success else f"{100 * recording.final_distance:.0f} cm off"
         style.caption(panel, f"{label}, {recording.task}: {end}")
-    style.legend_below(figure, legend(imagined is not None, recording.plans is not None))
+    style.legend_below(figure, legend(kind))
     return figure
 
 
@@ -117,25 +127,13 @@ def draw_subgoals(axes: Axes, imagined: Float[np.ndarray, "I 4"]) -> None:
 def subgoals(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I 4"] | None:
     """Return the subgoals in every state (m), imagined or planned.
 
-    None where there are none, or where they are codes of images.
+    None where there are none, or where they are features of images.
     """
-    if policy.state.spec.is_image:
-        return None
-    return in_every_state(policy, recording)
+    return None if policy.spec.is_image else in_every_state(policy, recording)
 
 
-def in_every_state(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I G"] | None:
-    """Return the subgoals in every state, imagined or planned; None if the agent has none."""
-    if recording.plans is not None:
-        return np.concatenate([recording.plans, recording.plans[-1:]])
-    if not imagination.imagines(policy.config.agent):
-        return None
-    goals = np.repeat(recording.goal[None], len(recording.observations), axis=0)
-    return imagination.subgoals(policy, recording.observations, goals, SUBGOALS)
-
-
-def legend(imagined: bool, planned: bool) -> list[Line2D]:
-    """Return the entries of everything on a table."""
+def legend(subgoals: str) -> list[Line2D]:
+    """Return the entries; ``subgoals`` are imagined, planned, or none."""
     hollow: dict[str, Any] = {"linestyle": "", "markerfacecolor": "none", "markeredgewidth": 2}
     dots: dict[str, Any] = {"linestyle": "", "color": maps.SUBGOAL, "markeredgecolor": style.INK}
     entries = [
@@ -150,10 +148,9 @@ def legend(imagined: bool, planned: bool) -> list[Line2D]:
         Line2D([], [], color=maps.REACHED, linewidth=2, label="way: goal reached (thick: puck)"),
         Line2D([], [], color=maps.FAILED, linewidth=2, label="way: not reached"),
     ]
-    kind = "planned" if planned else "imagined"
-    if imagined:
+    if subgoals:
         entries += [
-            Line2D([], [], marker="s", label=f"{kind} subgoals: hand", **dots),
+            Line2D([], [], marker="s", label=f"{subgoals} subgoals: hand", **dots),
             Line2D([], [], marker="o", label="and puck", **dots),
         ]
     return entries

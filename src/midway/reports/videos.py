@@ -1,6 +1,8 @@
-"""Videos of a policy with the subgoals that it imagines on its way."""
+"""Videos of a policy with the subgoals that it imagines on its way, as files or in a window."""
 
+import os
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import chain
@@ -11,12 +13,11 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
-from midway.envs import registry as environments
-from midway.reports import scenes, window
-from midway.reports.rollouts import Recording, record
-from midway.reports.runs import RunData, read
+from midway.reports import scenes
+from midway.reports.recordings import Recording, record
+from midway.reports.runs import RunData, agent_labels, read
 from midway.reports.scenes import Frame, Scene
-from midway.training import policy as policies
+from midway.runs import policy as policies
 from midway.types import ConfigurationError
 
 SECONDS = 8
@@ -30,9 +31,15 @@ HOLD = 0.8
 
 GIF_COLOURS = 64
 
+# Without -P the modules beside the program would hide those of Python's library.
+VIEWER = (sys.executable, "-P", str(Path(__file__).with_name("viewer.py")))
+
+RENDERING = ("PYOPENGL_PLATFORM", "MUJOCO_GL")
+"""Variables that this process may have set to draw without a display."""
+
 
 def watch(path: Path, out: Path | None, task: str, episodes: int, seed: int) -> Path:
-    """Write a video of a trained policy with mean actions.
+    """Write a video of a trained policy, which acts deterministically.
 
     Args:
         path: The run folder.
@@ -69,9 +76,9 @@ def show(path: Path, task: str, episodes: int, seed: int) -> None:
         ConfigurationError: As in ``watch``, or there is no display here.
     """
     run = read(path)
-    window.check()
+    check_display()
     frames, rate = film(run, task, episodes, seed, RATES[".mp4"])
-    window.play(frames, rate, f"midway: {path}")
+    play(frames, rate, f"midway: {path}")
 
 
 def film(
@@ -84,8 +91,9 @@ def film(
     """
     if episodes < 1:
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
-    policy = policies.load(run.folder, environments.make_vec(run.config.env).goal_spec)
-    title = f"{run.config.agent.upper()} on {run.config.env}, {task}"
+    policy = policies.load(run.folder)
+    (label,) = agent_labels([run.config.agent])
+    title = f"{label} on {run.config.env}, {task}"
     make = scenes.maker(run.folder, policy, title)
     recordings = record(policy, {task: episodes}, seed)
     longest = max(recording.length for recording in recordings)
@@ -155,3 +163,48 @@ def _frames(scene: Scene, recording: Recording, stride: int, rate: int) -> Itera
     last = scene.frame(recording.length)
     for _ in range(max(1, round(HOLD * rate))):
         yield last
+
+
+def check_display() -> None:
+    """Try the display.
+
+    Raises:
+        ConfigurationError: There is none; the text is one line that says why.
+    """
+    tried = subprocess.run(VIEWER, capture_output=True, env=_environment())
+    if tried.returncode != 0:
+        raise _no_display(tried.stderr)
+
+
+def play(frames: Iterator[Frame], rate: int, title: str) -> None:
+    """Show frames until the last one, or until the window is closed or Esc pressed.
+
+    Args:
+        frames: Pictures of one size.
+        rate: Frames per second, at most.
+        title: Title of the window.
+
+    Raises:
+        ConfigurationError: No window can be opened.
+    """
+    first = next(frames)
+    height, width = first.shape[:2]
+    command = [*VIEWER, str(width), str(height), str(rate), title]
+    with subprocess.Popen(command, stdin=PIPE, stderr=PIPE, env=_environment()) as viewer:
+        assert viewer.stdin is not None
+        with suppress(BrokenPipeError):  # the window was closed
+            for frame in chain([first], frames):
+                viewer.stdin.write(frame.tobytes())
+        _, words = viewer.communicate()
+    if viewer.returncode != 0:
+        raise _no_display(words)
+
+
+def _environment() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if name not in RENDERING}
+
+
+def _no_display(words: bytes) -> ConfigurationError:
+    """Return the error with the last line that the viewer said."""
+    lines = words.decode(errors="replace").strip().splitlines() or ["it cannot be opened"]
+    return ConfigurationError(f"--live needs a display, and there is none here: {lines[-1]}")

@@ -4,7 +4,6 @@ The memory of an agent that remembers nothing is an empty tree, which costs noth
 """
 
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any
 
 import jax
@@ -12,19 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from midway.types import EnvSpec, Memory, Remembering
+from midway.agent import AnyAgent, Memory
+from midway.types import EnvSpec
 
 Act = Callable[[Memory, Any, Any, Key[Array, ""]], tuple[Float[Array, "B action_dim"], Memory]]
 """``(memory, observation, goal, key) -> (actions, memory)``."""
 
 
-def begin(agent: ModuleType, config: Any, spec: EnvSpec, num_episodes: int) -> Memory:
+def begin(agent: AnyAgent, config: Any, spec: EnvSpec, num_episodes: int) -> Memory:
     """Return what the agent remembers before the first step of each episode."""
-    return agent.begin(config, spec, num_episodes) if isinstance(agent, Remembering) else ()
+    return agent.memory.begin(config, spec, num_episodes) if agent.memory else ()
 
 
 def act(
-    agent: ModuleType,
+    agent: AnyAgent,
     state: Any,
     memory: Memory,
     observation: Any,
@@ -34,11 +34,9 @@ def act(
     explore: bool,
 ) -> tuple[Float[Array, "B action_dim"], Memory]:
     """Return actions ``(B, action_dim)`` and the memory after them."""
-    if isinstance(agent, Remembering):
-        actions, memory = agent.act_on(state, memory, observation, goal, key, explore)
-    else:
-        actions = agent.act(state, observation, goal, key, explore)
-    return actions, memory
+    if agent.memory:
+        return agent.memory.act(state, memory, observation, goal, key, explore)
+    return agent.act(state, observation, goal, key, explore), memory
 
 
 def renew(memory: Memory, fresh: Memory, begun: Bool[Any, " B"]) -> Memory:
@@ -53,31 +51,35 @@ def renew(memory: Memory, fresh: Memory, begun: Bool[Any, " B"]) -> Memory:
 class Actor:
     """A policy in the middle of its episodes, ``actor(observation, goal) -> actions``.
 
-    Its first call begins an episode in every copy of the environment.
+    Its first call begins an episode in every environment.
 
     Args:
+        agent: The agent, for what it does with episodes that are over.
         act: The policy on a memory.
         begin: Returns the memory of as many new episodes.
         key: Key of all draws.
     """
 
-    def __init__(self, act: Act, begin: Callable[[int], Memory], key: Key[Array, ""]) -> None:
+    def __init__(
+        self, agent: AnyAgent, act: Act, begin: Callable[[int], Memory], key: Key[Array, ""]
+    ) -> None:
+        self._rest = agent.memory.rest if agent.memory else None
         self._act = act
         self._begin = begin
         self._key = key
         self._calls = 0
-        self._fresh: Memory = None
         self.memory: Memory = None
 
     def __call__(self, observation: Any, goal: Any) -> np.ndarray[Any, np.dtype[Any]]:
-        """Return actions ``(B, action_dim)`` for one step of every copy."""
+        """Return actions ``(B, action_dim)`` for one step of every environment."""
         if self._calls == 0:
-            self._fresh = self.memory = self._begin(len(observation))
+            self.memory = self._begin(len(observation))
         key = jax.random.fold_in(self._key, self._calls)
         self._calls += 1
         actions, self.memory = self._act(self.memory, observation, goal, key)
         return np.asarray(actions)
 
-    def restart(self, begun: Bool[Any, " B"]) -> None:
-        """Forget the episodes of these copies, in which new ones have begun."""
-        self.memory = renew(self.memory, self._fresh, begun)
+    def rest(self, done: Bool[Any, " B"]) -> None:
+        """Compute nothing more than needed for these episodes, which are over."""
+        if self._rest is not None:
+            self.memory = self._rest(self.memory, done)

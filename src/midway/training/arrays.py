@@ -1,10 +1,15 @@
 """Trees of arrays as flat dictionaries with readable names, for files."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
+import numpy as np
 from jaxtyping import PyTree
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import load_file, save_file
 
 from midway.types import ConfigurationError
 
@@ -36,3 +41,48 @@ def with_named_arrays(tree: Tree, arrays: Mapping[str, Any]) -> Tree:
         found.append(jax.numpy.asarray(array))
     tree = jax.tree_util.tree_unflatten(structure, found)
     return tree
+
+
+def networks_of(state: Any, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return the arrays of some parts of an agent's state, by part."""
+    return {name: eqx.filter(getattr(state, name), eqx.is_array) for name in names}
+
+
+def save_arrays(path: Path, tree: PyTree) -> None:
+    """Write the arrays of a tree as safetensors: a file that is there whole or not at all.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    arrays = {name: np.asarray(array) for name, array in named_arrays(tree).items()}
+    temporary = path.with_name(path.name + ".new")
+    try:
+        save_file(arrays, temporary)
+    except SafetensorError as error:
+        raise OSError(f"{path} cannot be written: {error}") from error
+    temporary.replace(path)
+
+
+def array_names(path: Path) -> list[str]:
+    """Return the names of the arrays in a file.
+
+    Raises:
+        ConfigurationError: The file cannot be read.
+    """
+    try:
+        with safe_open(path, "numpy") as file:
+            return list(file.keys())
+    except (OSError, SafetensorError) as error:
+        raise ConfigurationError(f"{path} cannot be read: {error}") from error
+
+
+def load_arrays(path: Path, tree: Tree) -> Tree:
+    """Return the tree with its arrays replaced by those of the same name in a file.
+
+    Raises:
+        ConfigurationError: The file cannot be read, or holds other arrays.
+    """
+    try:
+        return with_named_arrays(tree, load_file(path))
+    except (OSError, SafetensorError) as error:
+        raise ConfigurationError(f"{path} cannot be read: {error}") from error

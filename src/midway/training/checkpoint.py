@@ -48,10 +48,9 @@ class Checkpoints:
         step: int | None = self._manager.latest_step()
         return step
 
-    def shape(self, step: int, group: str, name: str) -> tuple[int, ...]:
-        """Return the shape of a stored array; nothing if the checkpoint cannot be read."""
-        stored = self._manager.item_metadata(step) or {}
-        return tuple(stored[group][name].shape) if name in stored.get(group, {}) else ()
+    def parts(self, step: int) -> tuple[str, ...]:
+        """Return the names of what a checkpoint holds; nothing if it cannot be read."""
+        return tuple(self._manager.item_metadata(step) or {})
 
     def restore(self, step: int, like: Any) -> Any:
         """Return the state of a step, with the structure, shapes and dtypes of ``like``.

@@ -38,9 +38,11 @@ class Collector:
 
     Attributes:
         env: A vector environment without autoreset.
-        observation: The newest observations of all copies.
-        begun: Copies in which the last step was followed by a new episode.
+        observation: The newest observations.
+        begun: Environments in which the last step was followed by a new episode.
         counts: Episodes that ended since the last row of metrics.
+        limit: Steps after which an episode is cut off, if that is before the environment's own; 0
+            for never.
         logged: Sum and number over the steps since then of each info that the environment wants
             logged, by its name in ``metrics.csv``.
     """
@@ -49,6 +51,7 @@ class Collector:
     observation: dict[str, Any]
     begun: np.ndarray[Any, np.dtype[np.bool_]]
     counts: EpisodeCounts = field(default_factory=EpisodeCounts)
+    limit: int = 0
     logged: dict[str, np.ndarray[Any, np.dtype[np.float64]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -57,13 +60,13 @@ class Collector:
 
     @staticmethod
     def start(env: Any, replay: ReplayState, seed: int) -> tuple["Collector", ReplayState]:
-        """Reset every copy and begin its first episode in the replay."""
+        """Reset every environment and begin its first episode in the replay."""
         observation, _ = env.reset(seed=seed)
         everyone = np.ones(env.num_envs, np.bool_)
         return Collector(env, observation, everyone), step.begin(replay, observation, everyone)
 
     def step(self, replay: ReplayState, choose: Actions) -> ReplayState:
-        """Take one step in every copy; begin new episodes where one has ended."""
+        """Take one step in every environment; begin new episodes where one has ended."""
         actions = choose(self.observation)
         self.observation, _, terminated, truncated, info = self.env.step(actions)
         for name, column in self.env.logged_info.items():
@@ -71,6 +74,8 @@ class Collector:
         everyone = np.ones(self.env.num_envs, np.bool_)
         replay = step.add(replay, actions, self.observation, everyone)
         ended = terminated | truncated
+        if self.limit:
+            ended = ended | (info["elapsed_steps"] >= self.limit)
         if ended.any():
             self.counts.episodes += int(ended.sum())
             self.counts.successes += int(terminated.sum())
@@ -106,7 +111,7 @@ class Collector:
     ) -> tuple["Collector", ReplayState]:
         """Return the collector that ``state_dict`` was taken from, on a new environment.
 
-        Where the environment cannot continue its episodes, new ones begin in every copy.
+        Where the environment cannot continue its episodes, new ones begin in all of them.
 
         Raises:
             ConfigurationError: The state is not one of this environment.
@@ -121,8 +126,10 @@ class Collector:
         logged = {name: np.array(value) for name, value in state.get("logged", {}).items()}
         everyone = np.ones(env.num_envs, np.bool_)
         if env.resumable:
-            return Collector(env, dict(state["observation"]), ~everyone, counts, logged), replay
+            return Collector(
+                env, dict(state["observation"]), ~everyone, counts, logged=logged
+            ), replay
         observation, _ = env.reset()
-        return Collector(env, observation, everyone, counts, logged), step.begin(
+        return Collector(env, observation, everyone, counts, logged=logged), step.begin(
             replay, observation, everyone
         )

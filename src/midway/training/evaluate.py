@@ -1,14 +1,16 @@
-"""Evaluation: episodes of a policy, without learning."""
+"""Rollouts of a policy without learning, and their evaluation."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 ActionKind: TypeAlias = Literal["mean", "sampled"]
 Policy: TypeAlias = Callable[[Any, Any], Any]
 """``(observation, goal) -> action`` over a batch."""
+
+Mask: TypeAlias = np.ndarray[Any, np.dtype[np.bool_]]
 
 PREFIX = "distance_"
 """Info of this beginning is a distance with a name."""
@@ -65,40 +67,74 @@ class Evaluation:
         return float(np.mean([episode.length for episode in self.episodes]))
 
 
-def run_episodes(env: Any, policy: Policy, task: str, actions: ActionKind, seed: int) -> Evaluation:
-    """Run one episode in each copy of the environment.
+class Moment(NamedTuple):
+    """One step of all environments of a rollout.
+
+    Attributes:
+        observation: Observations after the step.
+        info: The environments' info.
+        running: Environments whose episode was running before the step ``(K,)``.
+        ended: Those of them whose episode ended with it ``(K,)``.
+        success: Whether the goal was reached ``(K,)``.
+    """
+
+    observation: dict[str, Any]
+    info: Mapping[str, Any]
+    running: Mask
+    ended: Mask
+    success: Mask
+
+
+def rollout(env: Any, actor: Policy, observation: dict[str, Any]) -> Iterator[Moment]:
+    """Yield the steps of one episode in each environment, until the last one has ended.
+
+    An environment that is done goes round again, unrecorded, and the actor rests there.
 
     Args:
-        env: A vector environment without autoreset; one episode for each copy.
+        env: A vector environment without autoreset, just reset.
+        actor: The policy; it is told of episodes that are over if it has a method ``rest``.
+        observation: The observations of the reset.
+    """
+    running = np.ones(env.num_envs, np.bool_)
+    rest = getattr(actor, "rest", lambda done: None)
+    while running.any():
+        action = np.asarray(actor(observation["observation"], observation["desired_goal"]))
+        observation, _, terminated, truncated, info = env.step(action)
+        over = terminated | truncated
+        yield Moment(observation, info, running.copy(), over & running, terminated)
+        running &= ~over
+        if over.any():
+            observation, _ = env.reset(options={"reset_mask": over})
+            rest(~running)
+
+
+def run_episodes(env: Any, policy: Policy, task: str, actions: ActionKind, seed: int) -> Evaluation:
+    """Run one episode in each environment.
+
+    Args:
+        env: A vector environment without autoreset; one episode for each.
         policy: The policy, whose actions are of the kind ``actions``.
         task: Distribution of starts and goals.
         actions: ``mean`` or ``sampled``, for the record.
         seed: The same seed gives the same starts and goals.
     """
     observation, _ = env.reset(seed=seed, options={"task": task})
-    episodes: list[Episode | None] = [None] * env.num_envs
-    while any(episode is None for episode in episodes):
-        action = np.asarray(policy(observation["observation"], observation["desired_goal"]))
-        observation, _, terminated, truncated, info = env.step(action)
-        ended = terminated | truncated
-        for copy in np.flatnonzero(ended):
-            if episodes[copy] is None:
-                episodes[copy] = Episode(
-                    success=bool(terminated[copy]),
-                    length=int(info["elapsed_steps"][copy]),
-                    final_distance=float(info["distance"][copy]),
-                    final_distances=_named_distances(info, int(copy)),
-                )
-        if ended.any():
-            # Copies that are done go round again, unrecorded, until the last one has ended.
-            observation, _ = env.reset(options={"reset_mask": ended})
-    return Evaluation(task, actions, tuple(e for e in episodes if e is not None))
+    episodes: dict[int, Episode] = {}
+    for moment in rollout(env, policy, observation):
+        for number in map(int, np.flatnonzero(moment.ended)):
+            episodes[number] = Episode(
+                success=bool(moment.success[number]),
+                length=int(moment.info["elapsed_steps"][number]),
+                final_distance=float(moment.info["distance"][number]),
+                final_distances=_named_distances(moment.info, number),
+            )
+    return Evaluation(task, actions, tuple(episodes[number] for number in range(env.num_envs)))
 
 
-def _named_distances(info: Mapping[str, Any], copy: int) -> dict[str, float]:
-    """Return the distances of one copy that have a name: ``distance_hand`` as ``hand``."""
+def _named_distances(info: Mapping[str, Any], number: int) -> dict[str, float]:
+    """Return the named distances of one environment: ``distance_hand`` as ``hand``."""
     return {
-        name.removeprefix(PREFIX): float(values[copy])
+        name.removeprefix(PREFIX): float(values[number])
         for name, values in info.items()
         if name.startswith(PREFIX)
     }

@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -16,10 +17,13 @@ from pathlib import Path
 from typing import Any
 
 from midway.agents import registry
+from midway.settings import changed
 from midway.training.config import TrainConfig
-from midway.types import ConfigurationError, RelabelMix
+from midway.types import ConfigurationError
 
-FORMAT = 1
+FORMAT = 2
+"""Counted up when the files of a run change; format 1 is still understood."""
+
 PACKAGES = ("midway", "jax", "equinox", "optax", "mujoco", "gymnasium", "numpy")
 
 
@@ -55,21 +59,35 @@ class RunConfig:
             ConfigurationError: A value is missing, unknown or out of range.
         """
         try:
-            train = {**values["train"], "relabel": RelabelMix(**values["train"]["relabel"])}
-            agent = {
-                name: tuple(value) if isinstance(value, list) else value
-                for name, value in values["hyperparameters"].items()
-            }
+            values = _of_this_format(values)
+            agent = registry.get(values["agent"])
             return RunConfig(
                 env=values["env"],
                 agent=values["agent"],
                 preset=values["preset"],
                 seed=values["seed"],
-                train=TrainConfig(**train),
-                hyperparameters=registry.get(values["agent"]).Config(**agent),
+                train=changed(TrainConfig(), values["train"]),
+                hyperparameters=changed(agent.Config(), values["hyperparameters"]),
             )
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, AttributeError) as error:
             raise ConfigurationError(f"configuration not understood: {error}") from error
+
+
+def _of_this_format(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values with the names that they have in this format."""
+    if values.get("format") != 1:
+        return values
+    train, agent = dict(values["train"]), dict(values["hyperparameters"])
+    train["freeze_encoder_after"] = agent.pop("encoder_updates", 0)
+    if "image_translation" in agent:
+        agent["random_shift"] = agent.pop("image_translation")
+    return {**values, "train": train, "hyperparameters": agent}
+
+
+def run_name(env: str, agent: str, seed: int) -> str:
+    """Return the name of a run in file names; ids and dotted paths become plain words."""
+    parts = [re.sub(r"[^\w.-]+", "-", part).strip("-") for part in (env, agent)]
+    return "-".join([*parts, f"seed{seed}"])
 
 
 @dataclass(frozen=True)
@@ -105,7 +123,7 @@ class RunFolder:
 
     @property
     def past_policies(self) -> Path:
-        """Folder of the weights at some moments of training, for figures."""
+        """Folder of snapshots of the weights, for figures."""
         return self.path / "policies"
 
     @property
@@ -175,7 +193,7 @@ class RunFolder:
             ConfigurationError: This is no run folder, or not one of this version.
         """
         values = read_json(self.config_file)
-        if values.get("format") != FORMAT:
+        if values.get("format") not in (1, FORMAT):
             raise ConfigurationError(f"{self.config_file}: not a run of this version of midway")
         return RunConfig.from_json(values)
 

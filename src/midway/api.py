@@ -1,24 +1,23 @@
 """The Python interface: train, resume, load, evaluate."""
 
-import ast
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from midway import presets
+from midway.agent import AnyAgent
 from midway.agents import registry as agents
 from midway.envs import registry as environments
-from midway.training import loop
-from midway.training import policy as policies
+from midway.runs import policy as policies
+from midway.runs.folder import RunConfig, RunFolder, run_name
+from midway.runs.policy import Policy
+from midway.training import loop, seeds, state
 from midway.training.checkpoint import Checkpoints
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
-from midway.training.folder import RunConfig, RunFolder
 from midway.training.logging import Logger
-from midway.training.policy import Policy
 from midway.training.progress import Reporter, Silent, reporter
+from midway.training.state import Training
 from midway.types import ConfigurationError
 
 
@@ -37,7 +36,7 @@ class Run:
 
 def configure(
     env: str,
-    agent: str = "ris",
+    agent: str | AnyAgent = "ris",
     preset: str = "quick",
     seed: int = 0,
     changes: Mapping[str, Any] | None = None,
@@ -46,31 +45,26 @@ def configure(
 
     Args:
         env: Environment name.
-        agent: Agent name.
-        preset: ``paper`` or ``quick``.
-        seed: The one seed of every generator.
+        agent: Agent name, ``package.module:NAME``, or the agent itself.
+        preset: ``paper``, ``quick``, or the path of a preset file.
+        seed: The one seed of every generator, from 0.
         changes: Values by their field names in `TrainConfig` or the agent's ``Config``; text is
             read as Python literals.
 
     Raises:
-        ConfigurationError: A name is unknown or a value has the wrong type.
+        ConfigurationError: A name is unknown or a value is not allowed.
     """
-    environments.entry(env)
-    train, hyperparameters = presets.preset(env, agent, preset)
-    changes = changes or {}
-    allowed = (*_field_names(train), *_field_names(hyperparameters))
-    for name in changes:
-        if name not in allowed:
-            raise ConfigurationError(f"unknown setting {name!r}: use one of {', '.join(allowed)}")
-    # All at once: two values may fit each other, and one alone not the preset.
-    configs = [_changed(config, changes) for config in (train, hyperparameters)]
-    return RunConfig(env, agent, preset, seed, *configs)
+    if type(seed) is not int or not 0 <= seed < 2**63:
+        raise ConfigurationError(f"seed {seed!r}: must be a whole number from 0 to 2**63 - 1")
+    name = agents.name_of(agent)
+    resolved = presets.resolve(env, name, preset, changes)
+    return RunConfig(env, name, preset, seed, resolved.train, resolved.hyperparameters)
 
 
 def train(
     env: str,
     *,
-    agent: str = "ris",
+    agent: str | AnyAgent = "ris",
     preset: str = "quick",
     steps: int | None = None,
     seed: int = 0,
@@ -84,8 +78,8 @@ def train(
 
     Args:
         env: Environment name.
-        agent: ``ris``, ``sac`` and so on.
-        preset: ``paper`` or ``quick``.
+        agent: ``ris``, ``sac`` and so on, ``package.module:NAME``, or the agent itself.
+        preset: ``paper``, ``quick``, or the path of a preset file.
         steps: Environment steps; default: the preset's.
         seed: The one seed of every generator.
         num_envs: Parallel environments; default: the preset's.
@@ -101,10 +95,10 @@ def train(
     named = {"steps": steps, "num_envs": num_envs, "precision": precision}
     given = {name: value for name, value in named.items() if value is not None}
     config = configure(env, agent, preset, seed, {**(changes or {}), **given})
-    folder = RunFolder(Path(out or Path("runs") / f"{env}-{agent}-seed{seed}"))
-    training = build(config, folder)
+    folder = RunFolder(Path(out or Path("runs") / run_name(env, config.agent, seed)))
+    setup = setup_of(config, folder)
     folder.create(config)
-    return _run(training, progress)
+    return _run(config, folder, setup, progress)
 
 
 def resume(
@@ -131,9 +125,9 @@ def resume(
     named = {"steps": steps, "devices": devices}
     given: dict[str, Any] = {name: int(v) for name, v in named.items() if v is not None}
     config = dataclasses.replace(config, train=dataclasses.replace(config.train, **given))
-    training = build(config, folder)
+    setup = setup_of(config, folder)
     folder.note_resume(config)
-    return _run(training, progress)
+    return _run(config, folder, setup, progress)
 
 
 def load(path: str | Path) -> Policy:
@@ -142,9 +136,7 @@ def load(path: str | Path) -> Policy:
     Raises:
         ConfigurationError: The folder holds no policy, or a damaged or foreign one.
     """
-    folder = RunFolder(Path(path))
-    config = folder.load_config()
-    return policies.load(folder, environments.make_vec(config.env).goal_spec)
+    return policies.load(RunFolder(Path(path)))
 
 
 def evaluate(
@@ -171,74 +163,81 @@ def evaluate(
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
     policy = load(path)
     env = environments.make_vec(policy.config.env, num_envs=episodes, task=task)
-    # The seeds of training and its evaluations come from a hash; these must not meet them.
-    env_seed = int(np.random.SeedSequence((seed, 1)).generate_state(1)[0])
-    return run_episodes(env, policy.actor(actions, seed), task, actions, env_seed)
+    return run_episodes(env, policy.actor(actions, seed), task, actions, seeds.evaluation(seed))
 
 
-def build(config: RunConfig, folder: RunFolder) -> loop.Training:
-    """Return the run of this configuration at its start; nothing is written."""
+def setup_of(config: RunConfig, folder: RunFolder) -> state.Setup:
+    """Return what the run of this configuration is made of; nothing is written."""
 
     def make_env(num_envs: int, task: str) -> Any:
         return environments.make_vec(config.env, num_envs=num_envs, task=task)
 
-    return loop.Training(agents.get(config.agent), config, make_env, folder)
+    agent = agents.get(config.agent)
+    parts = (config.hyperparameters, config.train, config.seed, make_env, folder.path)
+    return state.Setup(agent, *parts)
 
 
-def _run(training: loop.Training, progress: bool) -> Run:
+class RunSinks:
+    """Puts what a run says into its folder, and on the terminal.
+
+    Args:
+        config: The configuration of the run.
+        folder: Its folder.
+        logger: Its CSV and TensorBoard files.
+        checkpoints: Its checkpoints.
+        say: Its terminal.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        folder: RunFolder,
+        logger: Logger,
+        checkpoints: Checkpoints,
+        say: Reporter,
+    ) -> None:
+        self._config = config
+        self._folder = folder
+        self._checkpoints = checkpoints
+        self.message, self.progress = say.message, say.advance
+        self.metrics, self.evaluation = logger.metrics, logger.evaluation
+
+    def snapshot(self, training: Training) -> None:
+        """Keep the weights of this step, for figures."""
+        policies.keep(self._folder, training)
+
+    def checkpoint(self, training: Training) -> None:
+        """Write a checkpoint and the policy.
+
+        Raises:
+            NonFiniteError: A network is not finite; nothing is written then.
+        """
+        loop.check_finite(training)
+        self._checkpoints.save(training.counters.steps, state.state_dict(training))
+        policies.save(self._folder, self._config, training)
+
+
+def _run(config: RunConfig, folder: RunFolder, setup: state.Setup, progress: bool) -> Run:
     """Restore the newest checkpoint if there is one, then train."""
-    with training.folder.lock():
-        return _run_locked(training, progress)
+    with folder.lock():
+        return _run_locked(config, folder, setup, progress)
 
 
-def _run_locked(training: loop.Training, progress: bool) -> Run:
-    folder = training.folder
+def _run_locked(config: RunConfig, folder: RunFolder, setup: state.Setup, progress: bool) -> Run:
     checkpoints = Checkpoints(folder.checkpoints)
     latest = checkpoints.latest()
-    if latest is not None:
-        training.restore(checkpoints, latest)
-    say: Reporter = reporter(training.config.train.steps, training.steps) if progress else Silent()
-    logger = Logger(
-        folder.metrics_file, folder.evaluation_file, folder.path / "events", training.steps
-    )
+    say: Reporter = reporter(config.train.steps, latest or 0) if progress else Silent()
+    logger = None
     try:
-        return Run(folder.path, loop.run(training, checkpoints, logger, say))
+        training = state.start(setup, say.message if latest is None else None)
+        if latest is not None:
+            training = state.restore(training, checkpoints, latest)
+        steps = training.counters.steps
+        logger = Logger(folder.metrics_file, folder.evaluation_file, folder.path / "events", steps)
+        sinks = RunSinks(config, folder, logger, checkpoints, say)
+        return Run(folder.path, loop.run(training, sinks))
     finally:
         say.close()
-        logger.close()
+        if logger is not None:
+            logger.close()
         checkpoints.close()
-
-
-def _field_names(config: Any) -> tuple[str, ...]:
-    return tuple(field.name for field in dataclasses.fields(config))
-
-
-def _changed(config: Any, changes: Mapping[str, Any]) -> Any:
-    """Return the dataclass with the values replaced that it has a field for."""
-    names = [name for name in changes if name in _field_names(config)]
-    return dataclasses.replace(
-        config, **{name: _converted(getattr(config, name), name, changes[name]) for name in names}
-    )
-
-
-def _converted(old: Any, name: str, value: Any) -> Any:
-    """Return the value in the type of the old one."""
-    if isinstance(value, str) and not isinstance(old, str):
-        try:
-            value = ast.literal_eval(value)
-        except (ValueError, SyntaxError):
-            raise ConfigurationError(f"{name} {value!r}: not a {type(old).__name__}") from None
-    if dataclasses.is_dataclass(old):
-        try:
-            value = type(old)(*value)  # type: ignore[operator]
-        except TypeError:
-            raise ConfigurationError(f"{name} {value!r}: one value for each share") from None
-    if isinstance(old, float) and isinstance(value, int):
-        value = float(value)
-    if isinstance(old, int) and isinstance(value, float) and value.is_integer():
-        value = int(value)
-    if type(value) is not type(old):
-        raise ConfigurationError(f"{name} {value!r}: must be a {type(old).__name__}")
-    if name == "precision" and value not in ("f32", "bf16"):
-        raise ConfigurationError(f"precision {value!r}: choose f32 or bf16")
-    return value

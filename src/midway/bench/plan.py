@@ -9,10 +9,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from midway import api
 from midway.agents import leap
+from midway.bench.pieces import Figures
 from midway.envs import registry as environments
-from midway.training import api
-from midway.training.bench import Figures
 
 REPETITIONS = 3
 """Without a warm-up, for a plan can take half a minute; it is compiled before."""
@@ -39,8 +39,8 @@ def plan(
     spec = environments.make_vec(env).goal_spec
     state = leap.create(config, spec, jax.random.key(0))
     inputs = (
-        leap.codes(state, jnp.zeros((1, *spec.observation_shape), spec.observation_dtype))[0],
-        leap.codes(state, jnp.zeros((1, *spec.goal_shape), spec.observation_dtype))[0],
+        state.encoder(jnp.zeros((1, *spec.observation_shape), spec.observation_dtype))[0],
+        state.encoder(jnp.zeros((1, *spec.goal_shape), spec.observation_dtype))[0],
         jnp.zeros((), jnp.int32),
         jnp.zeros((config.num_subgoals, config.latent_size)),
         jax.random.key(1),

@@ -1,5 +1,6 @@
 """Mazes from above, with what a policy does in them."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ from matplotlib.patches import Rectangle as Patch
 from matplotlib.ticker import MultipleLocator
 
 from midway.envs.mazes import Maze
+from midway.envs.views import MazeView
 from midway.reports import style
-from midway.reports.runs import row
-from midway.reports.study import Episode, Study
+from midway.reports.cache import Cache, Episode, Study
+from midway.reports.runs import Group, Runs, row
+from midway.reports.style import Picture
 
 MARGIN = 0.9
 """How much of the outer walls is drawn (m)."""
@@ -34,6 +37,46 @@ SAMPLES = 300
 
 SHOWN = {"hard": 8, "uniform": 12}
 """Episodes on a map."""
+
+
+def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
+    """Yield a map of each group: the policy of its first usable seed."""
+    if isinstance(runs.view, MazeView):
+        for group in runs.groups:
+            for study in cache.studies(group)[:1]:
+                yield _picture(runs, group, study)
+
+
+def _picture(runs: Runs, group: Group, study: Study) -> Picture:
+    return Picture(
+        f"{runs.slug}-{group.slug}-map",
+        lambda: draw(study, group.label),
+        f"{group.label} in the maze",
+        f"Ways of the deterministic policy ({study.where}). Walls are grey; an episode ends within "
+        "0.5 m of its goal."
+        + (" The subgoals are drawn by the subgoal policy at a start." if study.imagines else "")
+        + (" The plan is that of an episode from the middle of the start." if study.plans else "")
+        + _flips(runs, study),
+        f"Map of {runs.env} with the ways of {group.label}; success over all recorded episodes: "
+        + ", ".join(f"{task} {_rate(study, task)}" for task in SHOWN)
+        + ".",
+    )
+
+
+def _rate(study: Study, task: str) -> str:
+    reached = [episode.success for episode in study.episodes() if episode.task == task]
+    return style.percent(sum(reached) / len(reached))
+
+
+def _flips(runs: Runs, study: Study) -> str:
+    """Return how often an ant lies on its back at the end."""
+    if not isinstance(runs.view, MazeView) or runs.view.upright is None:
+        return ""
+    flipped = [episode.flipped for episode in study.episodes()]
+    return (
+        f" The ant ends on its back in {style.percent(sum(flipped) / len(flipped))} of "
+        f"{len(flipped)} recorded episodes."
+    )
 
 
 def panels(maze: Maze, columns: int, side: float = 0.0) -> tuple[Figure, list[Axes]]:
@@ -79,8 +122,9 @@ def draw(study: Study, label: str) -> Figure:
     if study.imagines:
         scatter_subgoals(axes[0], sample(study))
     if study.plans:
-        plan = study.plan()
-        draw_plan(axes[0], np.stack([plan["x"], plan["y"]], axis=1))
+        plan, (start, goal) = study.plan(), study.ends()
+        positions = np.stack([plan["x"], plan["y"]], axis=1)
+        draw_plan(axes[0], np.stack([start, *positions, goal]))
     imagined = "imagined" if study.imagines else "planned" if study.plans else ""
     style.legend_below(figure, _legend(imagined))
     return figure

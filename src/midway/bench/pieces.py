@@ -20,12 +20,13 @@ import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 
+from midway import api
 from midway.envs import registry as environments
 from midway.replay import buffer
-from midway.replay.storage import ReplayState, num_bytes
-from midway.training import api, codes, loop, step
+from midway.replay.storage import num_bytes
+from midway.runs.folder import RunFolder
+from midway.training import loop, state, step
 from midway.training.compilation import give_back_memory
-from midway.training.folder import RunFolder
 from midway.types import EnvSpec
 
 Figures = dict[str, Any]
@@ -78,7 +79,7 @@ def medians(pieces: dict[str, Callable[[], Any]], repetitions: int = REPETITIONS
 def update(env: str, agent: str, batch: int, precision: str) -> Figures:
     """Time one update, with sampling and relabelling, and compare it with its products alone.
 
-    Where observations are images, also time one on codes of them, as after ``encoder_updates``.
+    Where observations are images, also time one on their features, as with a frozen encoder.
     The limit is the time that the products would take at the rate of a product of 2048 x 256 by
     256 x 256 in the same precision, measured in turn with the update.
 
@@ -89,26 +90,29 @@ def update(env: str, agent: str, batch: int, precision: str) -> Figures:
         precision: ``f32`` or ``bf16``.
     """
     training = filled(env, agent, batch, precision, updates_per_call=1)
-    learner, train = training.learner, training.config.train
+    trainings = {"update_ms": training}
+    if training.program.spec.is_image:
+        frozen = filled(env, agent, batch, precision, updates_per_call=1)
+        state.freeze_encoder(frozen)
+        trainings["update_on_features_ms"] = frozen
     arguments = (jax.random.key(0), 0)
     inputs = (training.arrays, training.totals, training.replay, *arguments)
-    flops = _product_flops(learner.train, inputs)
-    replays = {"update_ms": training.replay}
-    if training.spec.is_image:
-        replays["update_on_codes_ms"] = codes.blank(training.replay)
+    flops = _product_flops(training.program.train, inputs)
 
-    def one_update(replay: ReplayState) -> Any:
-        training.arrays, training.totals = learner.train(
-            training.arrays, training.totals, replay, *arguments
+    def one_update(training: state.Training) -> Any:
+        training.arrays, training.totals = training.program.train(
+            training.arrays, training.totals, training.replay, *arguments
         )
         return training.totals
 
     sample = jax.jit(
-        lambda replay, key: buffer.sample(replay, training.spec, train.relabel, batch, key)
+        lambda replay, key: buffer.sample(
+            replay, training.program.spec, training.setup.train.relabel, batch, key
+        )
     )
     times = medians(
         {
-            **{name: partial(one_update, replay) for name, replay in replays.items()},
+            **{name: partial(one_update, each) for name, each in trainings.items()},
             "sample_ms": lambda: sample(training.replay, jax.random.key(1)),
             "product": _reference_product(precision),
         }
@@ -171,10 +175,12 @@ def replay(env: str, batch: int) -> Figures:
     capacity = transitions_of(environments.make_vec(env).goal_spec)
     training = filled(env, "sac", batch, "f32", 1, replay_capacity=capacity)
     observation = training.collector.observation
-    actions = np.zeros((training.config.train.num_envs, training.spec.action_dim), np.float32)
+    actions = np.zeros(
+        (training.setup.train.num_envs, training.program.spec.action_dim), np.float32
+    )
     everyone = np.ones(len(actions), np.bool_)
-    mix = training.config.train.relabel
-    sample = jax.jit(lambda ring, key: buffer.sample(ring, training.spec, mix, batch, key))
+    mix = training.setup.train.relabel
+    sample = jax.jit(lambda ring, key: buffer.sample(ring, training.program.spec, mix, batch, key))
 
     def add() -> Any:
         training.replay = step.add(training.replay, actions, observation, everyone)
@@ -183,7 +189,7 @@ def replay(env: str, batch: int) -> Figures:
     times = medians(
         {"add_ms": add, "sample_ms": lambda: sample(training.replay, jax.random.key(0))}
     )
-    size = buffer.memory_bytes(training.spec, capacity, training.config.train.num_envs)
+    size = buffer.memory_bytes(training.program.spec, capacity, training.setup.train.num_envs)
     return {**times, "gib": size / 2**30}
 
 
@@ -205,7 +211,7 @@ def memory(env: str, agent: str, batch: int, precision: str) -> Figures:
     rows = 8 * episodes * (spec.max_episode_steps + 2)
     training = filled(env, agent, batch, precision, 1, replay_capacity=rows)
     arguments = (training.arrays, training.totals, training.replay, jax.random.key(0), 0)
-    jax.block_until_ready(training.learner.train(*arguments))
+    jax.block_until_ready(training.program.train(*arguments))
     give_back_memory()  # as a run does when it logs
     size = num_bytes(training.replay)
     process, peak = resident_bytes()
@@ -238,20 +244,20 @@ def whole_loop(env: str, agent: str, batch: int, precision: str) -> Figures:
         precision: ``f32`` or ``bf16``.
     """
     training = filled(env, agent, batch, precision, updates_per_call=8)
-    learner = training.learner
+    program = training.program
 
     def turn() -> Any:
-        training.advance()
+        loop.advance(training)
         return training.totals
 
     def updates() -> Any:
-        training.arrays, training.totals = learner.train(
+        training.arrays, training.totals = program.train(
             training.arrays, training.totals, training.replay, jax.random.key(0), 0
         )
         return training.totals
 
     times = medians({"turn": turn, "updates": updates})
-    num_envs = training.config.train.num_envs
+    num_envs = training.setup.train.num_envs
     return {
         "steps_per_s": 1e3 * num_envs / times["turn"],
         "share_in_updates": times["updates"] / times["turn"],
@@ -260,7 +266,7 @@ def whole_loop(env: str, agent: str, batch: int, precision: str) -> Figures:
 
 def filled(
     env: str, agent: str, batch: int, precision: str, updates_per_call: int, **changes: Any
-) -> loop.Training:
+) -> state.Training:
     """Return a run of 8 environments that writes nothing, just before its first update.
 
     Args:
@@ -282,20 +288,21 @@ def filled(
         **changes,
     }
     config = api.configure(env, agent, "quick", 0, settings)
-    training = api.build(config, RunFolder(Path(tempfile.gettempdir()) / "midway-bench"))
-    if training.spec.is_image:
+    folder = RunFolder(Path(tempfile.gettempdir()) / "midway-bench")
+    training = state.start(api.setup_of(config, folder))
+    if training.program.spec.is_image:
         _fill_with_noise(training)
-    while training.steps < training.config.train.random_steps:
-        training.advance()
+    while training.counters.steps < training.setup.train.random_steps:
+        loop.advance(training)
     return training
 
 
-def _fill_with_noise(training: loop.Training) -> None:
+def _fill_with_noise(training: state.Training) -> None:
     """Write episodes of noise into the replay, which takes less long than to draw images."""
-    num_envs = training.config.train.num_envs
+    num_envs = training.setup.train.num_envs
     everyone = np.ones(num_envs, np.bool_)
     generator = np.random.default_rng(0)
-    actions = np.zeros((num_envs, training.spec.action_dim), np.float32)
+    actions = np.zeros((num_envs, training.program.spec.action_dim), np.float32)
     for number in range(1, IMAGE_ROWS // num_envs + 1):
         noise = {
             name: generator.integers(0, 256, value.shape, np.uint8)
@@ -304,10 +311,11 @@ def _fill_with_noise(training: loop.Training) -> None:
             for name, value in training.collector.observation.items()
         }
         training.replay = step.add(training.replay, actions, noise, everyone)
-        if number % training.spec.max_episode_steps == 0:
+        if number % training.program.spec.max_episode_steps == 0:
             training.replay = step.begin(training.replay, noise, everyone)
     training.replay = step.begin(training.replay, training.collector.observation, everyone)
-    training.steps = training.config.train.random_steps
+    steps = training.setup.train.random_steps
+    training.counters = training.counters._replace(steps=steps)
 
 
 def _product_flops(function: Any, arguments: tuple[Any, ...]) -> float:

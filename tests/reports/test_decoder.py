@@ -9,11 +9,13 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from untrained import save_untrained
 
 from drawing_here import needs_renderer
+from midway import api
 from midway.envs.registry import make_vec
-from midway.training import api, decoder, policy
-from midway.training.folder import RunFolder
+from midway.reports import decoder
+from midway.runs.folder import RunFolder
 
 pytestmark = needs_renderer
 
@@ -24,15 +26,13 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "push")
     changes = {"hidden": (8,), "num_envs": 1, "replay_capacity": 300, "random_steps": 10}
     config = api.configure("push", "sac", changes=changes)
-    training = api.build(config, folder)
-    folder.create(config)
-    policy.save(folder, config, training.state, 50)
+    save_untrained(folder, config, 50)
     return folder
 
 
 @pytest.fixture(autouse=True)
 def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
-    small = {"IMAGES": 60, "COPIES": 5, "UPDATES": 2, "UPDATES_PER_CALL": 2, "BATCH_SIZE": 4}
+    small = {"IMAGES": 60, "NUM_ENVS": 5, "UPDATES": 2, "UPDATES_PER_CALL": 2, "BATCH_SIZE": 4}
     for name, value in small.items():
         monkeypatch.setattr(decoder, name, value)
 
@@ -52,8 +52,7 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def of(folder: RunFolder, changed: Any = None) -> Any:
-    env = make_vec("push", num_envs=decoder.COPIES)
-    return decoder.of_policy(folder, changed or api.load(folder.path), env)
+    return decoder.of_policy(folder, changed or api.load(folder.path))
 
 
 def test_a_decoder_is_kept_and_made_anew_only_for_another_policy(
@@ -67,10 +66,9 @@ def test_a_decoder_is_kept_and_made_anew_only_for_another_policy(
     loaded = api.load(saved.path)
     later = of(saved, replace(loaded, step=60))
     assert len(fits) == 2
-    assert eqx.tree_equal(first, later)  # the same codes, the same seed
-    encoder = jax.tree.map(lambda x: 2 * x, eqx.filter(loaded.state.encoder, eqx.is_array))
-    encoder = eqx.combine(encoder, loaded.state.encoder)
-    changed = of(saved, replace(loaded, state=replace(loaded.state, encoder=encoder), step=60))
+    assert eqx.tree_equal(first, later)  # the same features, the same seed
+    doubled = jax.tree.map(lambda x: 2 * x, eqx.filter(loaded.state.encoder, eqx.is_array))
+    changed = of(saved, replace(loaded, encoder=eqx.combine(doubled, loaded.state.encoder)))
     assert len(fits) == 3
     assert not np.allclose(changed.scale, first.scale)
     assert not list(saved.path.glob("*.new"))
@@ -91,15 +89,15 @@ def test_images_are_of_starts_goals_and_random_actions() -> None:
     assert images.shape == (14, 84, 84, 3)
     observation, _ = make_vec("push", num_envs=3).reset(seed=5)
     np.testing.assert_array_equal(images[:3], observation["observation"])
-    np.testing.assert_array_equal(images[3:6], observation["desired_goal"])
-    moved = (images[6:9] != images[:3]).any((1, 2, 3))
+    moved = (images[3:6] != images[:3]).any((1, 2, 3))
     assert moved.all()
+    env = make_vec("push", num_envs=3)
     np.testing.assert_array_equal(images, decoder.sample_images(env, 14, seed=5))
 
 
 def test_a_policy_of_states_has_no_image_encoder(tmp_path: Path, saved: RunFolder) -> None:
-    assert decoder.has_encoder(api.load(saved.path))
+    assert decoder.encoder_of(api.load(saved.path)) is not None
+    folder = RunFolder(tmp_path / "state")
     config = api.configure("push-state", "sac", changes={"hidden": (8,), "num_envs": 1})
-    spec = make_vec("push-state").goal_spec
-    state = api.agents.get("sac").create(config.hyperparameters, spec, jax.random.key(0))
-    assert not decoder.has_encoder(policy.Policy(api.agents.get("sac"), state, config))
+    save_untrained(folder, config, 50)
+    assert decoder.encoder_of(api.load(folder.path)) is None

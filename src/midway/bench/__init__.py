@@ -1,0 +1,1 @@
+"""How fast and how large the pieces are on this machine."""

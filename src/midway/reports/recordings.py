@@ -1,0 +1,166 @@
+"""Episodes of a saved policy, recorded step by step, with the subgoals on their way."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+
+from midway.agent import AnyAgent, SubgoalDistribution
+from midway.envs import registry as environments
+from midway.runs.policy import Policy
+from midway.training.evaluate import rollout
+
+Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
+
+SUBGOALS = 20
+"""Imagined subgoals that are drawn for a state and a goal."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One episode.
+
+    Attributes:
+        task: What start and goal were drawn from.
+        observations: ``(T + 1, ...)``, from the start to the last state.
+        goal: The desired goal.
+        states: What success is measured on ``(T + 1, ...)``: the achieved goals, or the true states
+            where these are images.
+        target: What the states have to come near.
+        success: Whether the goal was reached.
+        final_distance: Distance to the goal at the end (m).
+        plans: Subgoals that the agent followed ``(T, N, ...)``, where it plans any.
+    """
+
+    task: str
+    observations: Array
+    goal: Array
+    states: Array
+    target: Array
+    success: bool
+    final_distance: float
+    plans: Array | None = None
+
+    @property
+    def length(self) -> int:
+        """Steps taken."""
+        return len(self.observations) - 1
+
+    @property
+    def kind(self) -> str:
+        """What the subgoals are, if there are any."""
+        return "imagined" if self.plans is None else "planned"
+
+
+def record(policy: Policy, episodes: Mapping[str, int], seed: int) -> list[Recording]:
+    """Run episodes of the deterministic policy, all at once.
+
+    Args:
+        policy: The policy, in the environment that it was trained for.
+        episodes: Number of episodes of each task.
+        seed: The same seed gives the same starts and goals.
+    """
+    tasks = np.repeat(list(episodes), list(episodes.values()))
+    env = environments.make_vec(policy.config.env, num_envs=len(tasks))
+    observation = _reset(env, tasks, seed)
+    goals, targets = observation["desired_goal"].copy(), env.success_pair(observation)[1].copy()
+    seen = [(observation["observation"].copy(), env.success_pair(observation)[0].copy())]
+    actor, plans = policy.actor(), []
+    lengths = np.zeros(len(tasks), np.int64)
+    for moment in rollout(env, actor, observation):
+        states = env.success_pair(moment.observation)[0]
+        seen.append((moment.observation["observation"].copy(), states.copy()))
+        plans.append(plan(policy, actor.memory))
+        lengths += moment.running
+    return [
+        _recording(policy, seen, plans, number, lengths, task, goals[number], targets[number])
+        for number, task in enumerate(tasks.tolist())
+    ]
+
+
+def _recording(
+    policy: Policy,
+    seen: list[tuple[Array, Array]],
+    plans: list[Array | None],
+    number: int,
+    lengths: Int[Array, " episodes"],
+    task: str,
+    goal: Array,
+    target: Array,
+) -> Recording:
+    """Return the episode of one environment."""
+    length = int(lengths[number])
+    states = np.stack([state[number] for _, state in seen[: length + 1]])
+    ends = states[-1:], target[None]
+    measure = policy.spec.task
+    followed = [each[number] for each in plans[:length] if each is not None]
+    return Recording(
+        task=task,
+        observations=np.stack([observation[number] for observation, _ in seen[: length + 1]]),
+        goal=goal,
+        states=states,
+        target=target,
+        success=bool(measure(*ends)[1][0]),
+        final_distance=float(measure.distance(*ends)[0]),
+        plans=np.stack(followed) if followed else None,
+    )
+
+
+def _reset(env: Any, tasks: Array, seed: int) -> dict[str, Array]:
+    """Begin one episode in each environment, each with a task of its own."""
+    observation: dict[str, Array] = {}
+    for task in dict.fromkeys(tasks.tolist()):
+        options = {"task": task, "reset_mask": tasks == task}
+        observation, _ = env.reset(seed=seed, options=options)
+    return observation
+
+
+def plans(agent: AnyAgent) -> bool:
+    """Return whether an agent plans subgoals as it acts."""
+    return agent.memory is not None and agent.memory.plan is not None
+
+
+def plan(policy: Policy, memory: Any) -> Array | None:
+    """Return the planned subgoals ``(B, N, G)`` that a memory holds; None if there are none."""
+    ability = policy.agent.memory
+    if ability is None or ability.plan is None:
+        return None
+    return np.asarray(_plan(ability.plan, policy.state, memory))
+
+
+@eqx.filter_jit
+def _plan(read: Any, state: Any, memory: Any) -> Any:
+    return read(state, memory)
+
+
+def draws(found: SubgoalDistribution, count: int, seed: int = 0) -> Float[np.ndarray, "B count G"]:
+    """Return draws of subgoals as achieved goals.
+
+    All pairs share their noise: along an episode subgoals move and do not flicker.
+
+    Args:
+        found: The distribution of subgoals of B pairs of state and goal.
+        count: Draws for each pair.
+        seed: Seed of the draws.
+    """
+    location, scale = found.location.achieved_goal, found.scale.achieved_goal
+    noise = np.random.default_rng(seed).laplace(size=(count, location.shape[-1]))
+    return np.asarray(location[:, None] + scale[:, None] * noise)
+
+
+def imagined(policy: Policy, recording: Recording) -> SubgoalDistribution:
+    """Return the distribution of subgoals in every state of an episode."""
+    goals = np.repeat(recording.goal[None], len(recording.observations), axis=0)
+    return policy.subgoals(recording.observations, goals)
+
+
+def in_every_state(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I G"] | None:
+    """Return the subgoals in every state, imagined or planned; None if the agent has none."""
+    if recording.plans is not None:
+        return np.concatenate([recording.plans, recording.plans[-1:]])
+    if policy.agent.subgoals is None:
+        return None
+    return draws(imagined(policy, recording), SUBGOALS)

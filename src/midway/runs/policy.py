@@ -1,0 +1,188 @@
+"""Saved policies: weights and a description that others can load."""
+
+import dataclasses
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from midway.agent import AnyAgent, Encoder, SubgoalDistribution
+from midway.agents import registry
+from midway.runs.folder import FORMAT, RunConfig, RunFolder, read_json, write_json
+from midway.training import acting, freeze
+from midway.training.arrays import array_names, load_arrays, networks_of, save_arrays
+from midway.training.evaluate import ActionKind
+from midway.training.state import FROZEN, Training
+from midway.training.step import create_state
+from midway.types import EnvSpec
+
+Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A trained policy, ``policy(observation, goal) -> action``.
+
+    Attributes:
+        agent: The agent.
+        state: The agent's state with the saved networks; its optimisers are at their start.
+        config: The run that trained it.
+        spec: The environment that it acts in.
+        step: The environment step that it was saved at; None if its file does not say.
+        encoder: The frozen encoder, where the agent reads features of images.
+    """
+
+    agent: AnyAgent
+    state: Any
+    config: RunConfig
+    spec: EnvSpec
+    step: int | None = None
+    encoder: Encoder | None = None
+
+    def __call__(self, observation: Any, goal: Any) -> Array:
+        """Return the deterministic action, ``(action_dim,)`` or ``(B, action_dim)``.
+
+        Args:
+            observation: One observation or a batch ``(B, ...)``.
+            goal: One goal or a batch ``(B, ...)``.
+        """
+        observation, goal = np.asarray(observation), np.asarray(goal)
+        single = observation.ndim == len(self.spec.observation_shape)
+        if single:
+            observation, goal = observation[None], goal[None]
+        actions = self._act(observation, goal, jax.random.key(0), explore=False)
+        return actions[0] if single else actions
+
+    def sample(self, observation: Any, goal: Any, key: Any) -> Array:
+        """Return sampled actions ``(B, action_dim)`` for batches."""
+        return self._act(observation, goal, key, explore=True)
+
+    def actor(self, actions: ActionKind = "mean", seed: int = 0) -> acting.Actor:
+        """Return the policy as one that remembers its episodes, from their first step on.
+
+        An agent that remembers nothing acts in the same way without. Others plan anew or start
+        their time anew on each call where this is not used.
+
+        Args:
+            actions: ``mean`` (deterministic) or ``sampled``.
+            seed: Seed of all draws.
+        """
+        explore = actions == "sampled"
+        act = partial(_act_on, self.agent, self.encoder, self.state, explore=explore)
+        begin = partial(acting.begin, self.agent, self.config.hyperparameters, self.state.spec)
+        return acting.Actor(self.agent, act, begin, jax.random.key(seed))
+
+    def features(self, observation: Any) -> Array:
+        """Return what the networks' state reads of observations or goals ``(B, ...)``."""
+        return np.asarray(_features(self.encoder, observation))
+
+    def value(self, observation: Any, goal: Any) -> Array:
+        """Return the agent's value of each pair ``(B,)``; it must have one."""
+        assert self.agent.value is not None
+        estimate = self.agent.value.estimate
+        return np.asarray(_on_features(estimate, self.encoder, self.state, observation, goal))
+
+    def subgoals(self, observation: Any, goal: Any) -> SubgoalDistribution:
+        """Return the subgoals imagined for each pair ``(B, ...)``; the agent must imagine any."""
+        found = _on_features(self.agent.subgoals, self.encoder, self.state, observation, goal)
+        in_numpy: SubgoalDistribution = jax.tree.map(np.asarray, found)
+        return in_numpy
+
+    def _act(self, observation: Any, goal: Any, key: Any, explore: bool) -> Array:
+        pair = (observation, goal, key, explore)
+        return np.asarray(_on_features(self.agent.act, self.encoder, self.state, *pair))
+
+
+def _features(encoder: Encoder | None, observation: Any) -> Any:
+    return observation if encoder is None else _encoded(encoder, observation)
+
+
+@eqx.filter_jit
+def _encoded(encoder: Any, observation: Any) -> Any:
+    return encoder(observation)
+
+
+@eqx.filter_jit
+def _on_features(
+    function: Any, encoder: Any, state: Any, observation: Any, goal: Any, *others: Any
+) -> Any:
+    pair = (observation, goal) if encoder is None else (encoder(observation), encoder(goal))
+    return function(state, *pair, *others)
+
+
+@eqx.filter_jit
+def _act_on(
+    agent: AnyAgent,
+    encoder: Any,
+    state: Any,
+    memory: Any,
+    observation: Any,
+    goal: Any,
+    key: Any,
+    *,
+    explore: bool,
+) -> Any:
+    pair = (observation, goal) if encoder is None else (encoder(observation), encoder(goal))
+    return acting.act(agent, state, memory, *pair, key, explore=explore)
+
+
+def save(folder: RunFolder, config: RunConfig, training: Training) -> None:
+    """Write ``policy.safetensors`` and ``policy.json``, each whole or not at all."""
+    _save_weights(folder.policy_weights, training)
+    description = {
+        "format": FORMAT,
+        "step": training.counters.steps,
+        **config.to_json(),
+        "spec": training.env_spec.to_json(),
+    }
+    write_json(folder.policy_config, description)
+
+
+def keep(folder: RunFolder, training: Training) -> None:
+    """Write a snapshot of the weights to ``policies/step-N.safetensors``."""
+    folder.past_policies.mkdir(exist_ok=True)
+    name = f"step-{training.counters.steps}.safetensors"
+    _save_weights(folder.past_policies / name, training)
+
+
+def _save_weights(path: Path, training: Training) -> None:
+    networks = networks_of(training.state, training.setup.agent.networks)
+    save_arrays(path, networks | _frozen(training.encoder))
+
+
+def _frozen(encoder: Encoder | None) -> dict[str, Any]:
+    """Return the arrays of a frozen encoder by their name in files; nothing without one."""
+    return {} if encoder is None else {FROZEN: eqx.filter(encoder, eqx.is_array)}
+
+
+def load(folder: RunFolder, weights: Path | None = None) -> Policy:
+    """Return the policy of a run folder; no environment is made.
+
+    Args:
+        folder: The run folder.
+        weights: A snapshot of its weights instead of the newest.
+
+    Raises:
+        ConfigurationError: The folder holds no policy, or a damaged one.
+    """
+    description = read_json(folder.policy_config)
+    config = RunConfig.from_json(description)
+    spec = EnvSpec.from_json({"task": None, **description.get("spec", {})})
+    agent = registry.get(config.agent)
+    state = create_state(agent, config.hyperparameters, spec, jax.random.key(0))
+    path, encoder = weights or folder.policy_weights, None
+    if agent.freezing and any(name.startswith(FROZEN) for name in array_names(path)):
+        encoder = agent.freezing.encoder(state)
+        features = freeze.encoded_spec(spec, encoder)
+        state = create_state(agent, config.hyperparameters, features, jax.random.key(0))
+    parts = networks_of(state, agent.networks) | _frozen(encoder)
+    arrays = load_arrays(path, parts)
+    if encoder is not None:
+        encoder = eqx.combine(arrays.pop(FROZEN), encoder)
+    loaded = {name: eqx.combine(arrays[name], getattr(state, name)) for name in arrays}
+    state = dataclasses.replace(state, **loaded)
+    return Policy(agent, state, config, spec, description.get("step"), encoder)

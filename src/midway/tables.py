@@ -1,0 +1,98 @@
+"""CSV files: whole tables, and rows that are appended as a run goes on."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from midway.types import ConfigurationError
+
+Table: TypeAlias = dict[str, np.ndarray[Any, np.dtype[Any]]]
+"""Columns by name: float64, or text for the columns of ``TEXT_COLUMNS``."""
+
+TEXT_COLUMNS = ("task", "actions")
+
+
+def read(path: Path) -> Table:
+    """Return the columns of a CSV file; none if it is not there or has no rows.
+
+    A last line that is being written while we read is left out.
+
+    Raises:
+        ConfigurationError: The file holds something else.
+    """
+    if not path.exists():
+        return {}
+    try:
+        header, *rows = _rows(path) or [[]]
+        whole = [row for row in rows if len(row) == len(header)]
+        columns = dict(zip(header, zip(*whole, strict=True), strict=False))
+        return {
+            name: np.array(values)
+            if name in TEXT_COLUMNS
+            else np.array([value or "nan" for value in values], np.float64)
+            for name, values in columns.items()
+        }
+    except (OSError, ValueError, csv.Error) as error:
+        raise ConfigurationError(f"{path} cannot be read: {error}") from error
+
+
+def write(path: Path, table: Mapping[str, np.ndarray[Any, np.dtype[Any]]]) -> None:
+    """Write a CSV file that is there whole or not at all; numbers with six digits."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    columns = [
+        [f"{value:.6g}" if isinstance(value, float) else value for value in column.tolist()]
+        for column in table.values()
+    ]
+    _replace(path, [list(table), *zip(*columns, strict=True)])
+
+
+class Appender:
+    """A CSV file that rows are appended to; the first row decides the columns.
+
+    Args:
+        path: The file.
+        until: Keep only rows up to this step: what follows will be computed again.
+    """
+
+    def __init__(self, path: Path, until: int) -> None:
+        self._path = path
+        self._columns: list[str] | None = None
+        if path.exists():
+            self._truncate(until)
+
+    def write(self, row: Mapping[str, object]) -> None:
+        """Append one row and put it on disk.
+
+        Values of columns that the first row did not have are not written.
+        """
+        if self._columns is None:
+            self._columns = list(row)
+            with self._path.open("w", newline="") as file:
+                csv.writer(file).writerow(self._columns)
+        with self._path.open("a", newline="") as file:
+            csv.writer(file).writerow([row.get(column, "") for column in self._columns])
+
+    def _truncate(self, until: int) -> None:
+        rows = _rows(self._path)
+        if not rows:
+            return
+        self._columns = rows[0]
+        step = self._columns.index("step")
+        # A last line that a killed process wrote in part has too few values.
+        kept = [r for r in rows[1:] if len(r) == len(rows[0]) and int(r[step]) <= until]
+        _replace(self._path, [rows[0], *kept])
+
+
+def _rows(path: Path) -> list[list[str]]:
+    with path.open(newline="") as file:
+        return list(csv.reader(file))
+
+
+def _replace(path: Path, rows: list[Any]) -> None:
+    temporary = path.with_name(path.name + ".new")
+    with temporary.open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    temporary.replace(path)

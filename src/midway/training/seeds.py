@@ -1,0 +1,50 @@
+"""Every stream of random numbers of a run, from its one seed."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Key
+
+PRETRAINING, EVALUATION = 2, 1
+"""What tells these streams apart from each other and from those of training."""
+
+
+class Streams(NamedTuple):
+    """Seeds and keys of a training run; further draws fold a counter of steps or updates in.
+
+    Attributes:
+        env: Seed of the environments that data are collected in.
+        evaluation: Seed of the environments of its evaluations.
+        action: Seed of the uniform random actions.
+        network_key: Of the networks' initial weights.
+        update_key: Of the updates.
+        act_key: Of sampled actions.
+        evaluation_key: Of sampled actions in evaluations.
+    """
+
+    env: int
+    evaluation: int
+    action: int
+    network_key: Key[Array, ""]
+    update_key: Key[Array, ""]
+    act_key: Key[Array, ""]
+    evaluation_key: Key[Array, ""]
+
+
+def training(seed: int) -> Streams:
+    """Return the streams of a training run."""
+    env, evaluation, action, key = np.random.SeedSequence(seed).generate_state(4)
+    keys = jax.random.split(jax.random.key(int(key)), 4)
+    return Streams(int(env), int(evaluation), int(action), *keys)
+
+
+def pretraining(seed: int) -> tuple[int, Key[Array, ""]]:
+    """Return the seed of the states that are pre-trained on, and the key of its updates."""
+    env, key = np.random.SeedSequence((seed, PRETRAINING)).generate_state(2)
+    return int(env), jax.random.key(int(key))
+
+
+def evaluation(seed: int) -> int:
+    """Return the seed of the environments of `midway evaluate`, which no training meets."""
+    return int(np.random.SeedSequence((seed, EVALUATION)).generate_state(1)[0])

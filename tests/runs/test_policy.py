@@ -1,0 +1,97 @@
+"""Saved policies and configurations: without an environment, there and back, and of format 1."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import midway
+from midway.envs import registry
+from midway.envs.push import IMAGE_SPEC, STATE_SPEC
+from midway.runs.folder import RunFolder
+from midway.types import ConfigurationError, EnvSpec, UnknownTask
+
+RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
+TINY = {
+    "hidden": (8,),
+    "batch_size": 8,
+    "num_envs": 4,
+    "random_steps": 40,
+    "replay_capacity": 2_000,
+    "evaluation_episodes": 2,
+    "steps": 80,
+}
+
+
+def test_a_policy_loads_without_an_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = midway.train("point-u", agent="sac", out=tmp_path / "run", changes=TINY)
+    spec = midway.make_vec("point-u").goal_spec
+
+    def no_environment(*arguments: Any, **options: Any) -> Any:
+        raise AssertionError("an environment was made")
+
+    monkeypatch.setattr(registry, "make_vec", no_environment)
+    monkeypatch.setattr(registry.Declaration, "factory", no_environment)
+    policy = midway.load(run.path)
+    assert policy.spec == spec
+    zeros = np.zeros((3, 4), np.float32)
+    assert policy(zeros, zeros).shape == (3, 2)
+    assert policy.value(zeros, zeros).shape == (3,)
+
+
+SPECS = [
+    IMAGE_SPEC,
+    STATE_SPEC,
+    IMAGE_SPEC.encoded(16),
+    midway.make_vec("point-u").goal_spec,
+    midway.make_vec("ant-u").goal_spec,
+]
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.name)
+def test_specifications_come_back_from_their_files(spec: EnvSpec) -> None:
+    assert EnvSpec.from_json(json.loads(json.dumps(spec.to_json()))) == spec
+
+
+def test_a_rule_of_success_that_is_not_stored_judges_nothing() -> None:
+    spec = replace(STATE_SPEC, task=UnknownTask())
+    back = EnvSpec.from_json(json.loads(json.dumps(spec.to_json())))
+    assert back == spec
+    with pytest.raises(ConfigurationError, match="known to the environment alone"):
+        back.task(np.zeros((1, 4)), np.zeros((1, 4)))
+
+
+@pytest.mark.parametrize("values", [{}, {"task": None}, {"task": None, "nothing": 1}])
+def test_specifications_that_are_not_understood_are_refused(values: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError, match="environment not understood"):
+        EnvSpec.from_json(values)
+
+
+COMMITTED = sorted((RESULTS / "push").glob("*/config.json"))
+COMMITTED += sorted((RESULTS / "point-mazes").glob("*/config.json"))[:6]
+
+
+@pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.parent.name)
+def test_configurations_of_format_1_are_understood(path: Path) -> None:
+    values = json.loads(path.read_text())
+    assert values["format"] == 1
+    config = RunFolder(path.parent).load_config()
+    assert (config.env, config.agent, config.seed) == tuple(
+        values[name] for name in ("env", "agent", "seed")
+    )
+    before = dict(values["hyperparameters"])
+    assert config.train.freeze_encoder_after == before.pop("encoder_updates", 0)
+    shift = before.pop("image_translation", None)
+    found = json.loads(json.dumps(config.to_json()))
+    assert shift is None or found["hyperparameters"]["random_shift"] == shift
+    assert found["hyperparameters"].items() >= before.items()
+    assert found["train"].items() >= values["train"].items()
+
+
+def test_there_are_configurations_of_format_1() -> None:
+    assert len(COMMITTED) > 6
