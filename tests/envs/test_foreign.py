@@ -1,17 +1,27 @@
-"""A goal environment that is not ours, by its own id."""
+"""Goal environments that are not midway's: stepped, ended, read, stored and trained on."""
 
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import fakes
 import gymnasium
-import jax
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 
 import midway
-from midway.errors import ConfigurationError
+from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, admit, describe, with_limit
+from midway.envs.sources import source
+from midway.errors import ConfigurationError, NonFiniteError
 
 TINY = {
     "hidden": (8,),
@@ -24,94 +34,357 @@ TINY = {
     "log_every": 20,
     "checkpoint_every": 60,
 }
-
-
-class Reach(gymnasium.Env[dict[str, Any], Any]):
-    """A hand on a line whose goal is its place alone; actions are in [0, 4]."""
-
-    def __init__(self) -> None:
-        box = spaces.Box(-10.0, 10.0, (2,), np.float64)
-        place = spaces.Box(-10.0, 10.0, (1,), np.float64)
-        self.observation_space = spaces.Dict(
-            {"observation": box, "achieved_goal": place, "desired_goal": place}
-        )
-        self.action_space = spaces.Box(0.0, 4.0, (1,), np.float32)
-        self.state = np.zeros(2)
-        self.goal = np.zeros(1)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        self.state = self.np_random.uniform(-1, 1, 2)
-        self.goal = self.np_random.uniform(3, 4, 1)
-        return self.observe(), {}
-
-    def step(self, action: Any) -> Any:
-        assert self.action_space.contains(action)
-        self.state = np.array([self.state[0] + (action[0] - 2) / 2, action[0]])
-        observation = self.observe()
-        reward = self.compute_reward(observation["achieved_goal"], self.goal, {})
-        return observation, reward, False, False, {}
-
-    def observe(self) -> dict[str, Any]:
-        return {
-            "observation": self.state,
-            "achieved_goal": self.state[:1],
-            "desired_goal": self.goal,
-        }
-
-    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> float:
-        return 0.0 if abs(achieved[0] - desired[0]) < 0.3 else -1.0
+RIGHT = np.array([[1.0, 0.0], [1.0, 0.0]], np.float32)
 
 
 @pytest.fixture(autouse=True)
-def reach() -> Iterator[None]:
-    gymnasium.register("tests/Reach-v0", Reach, max_episode_steps=20)
+def registered() -> Iterator[None]:
+    gymnasium.register("tests/Reach-v0", fakes.Plane, max_episode_steps=20)
     yield
     gymnasium.registry.pop("tests/Reach-v0")
 
 
-def test_actions_are_scaled_and_reward_is_minus_one_until_the_goal() -> None:
-    env = midway.make_vec("tests/Reach-v0", num_envs=2)
-    observation, _ = env.reset(seed=0)
+def plane(settings: Settings | None = None, **options: Any) -> Foreign:
+    return describe(fakes.limited, settings, options)
+
+
+def run(env: ForeignVectorEnv, steps: int, seed: int = 0) -> list[Any]:
+    """Return all that an environment shows in so many steps of random actions."""
+    observation, _ = env.reset(seed=seed)
+    shown = [observation]
+    rngs = [np.random.default_rng(copy) for copy in range(env.num_envs)]
+    for _ in range(steps):
+        actions = np.stack([rng.uniform(-1, 1, 2) for rng in rngs]).astype(np.float32)
+        observation, _, terminated, truncated, info = env.step(actions)
+        flags = {"terminated": terminated, "truncated": truncated, "failed": info["failed"]}
+        shown.append(observation | flags | {"elapsed": info["elapsed_steps"]})
+        if (terminated | truncated).any():
+            shown.append(env.reset(options={"reset_mask": terminated | truncated})[0])
+    env.close()
+    return shown
+
+
+def check_same(first: list[Any], second: list[Any], rows: slice = slice(None)) -> None:
+    for one, other in zip(first, second, strict=True):
+        assert one.keys() == other.keys()
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name][rows], err_msg=name)
+
+
+def test_actions_and_goals_are_the_environments_own() -> None:
+    env = ForeignVectorEnv(plane(), 2)
+    observation, info = env.reset(seed=0)
     start = observation["achieved_goal"].copy()
-    observation, reward, terminated, _, _ = env.step(np.array([[1.0], [-1.0]], np.float32))
+    observation, reward, _, _, info = env.step(np.array([[1, 0], [-1, 9]], np.float32))
     moved = observation["achieved_goal"] - start
-    np.testing.assert_allclose(moved, [[1.0], [-1.0]], rtol=1e-5)
+    np.testing.assert_allclose(moved, [[0.25, 0], [-0.25, 0.25]], atol=1e-6)
     assert reward.tolist() == [-1.0, -1.0]
-    for _ in range(19):
-        observation, reward, terminated, truncated, info = env.step(np.full((2, 1), 0.4, "float32"))
-        distance = np.abs(observation["achieved_goal"] - observation["desired_goal"])[:, 0]
-        assert (terminated == (distance < 0.3)).all()
-        np.testing.assert_allclose(info["distance"], distance, rtol=1e-5)
-        ended = terminated | truncated
-        if ended.any():
-            env.reset(options={"reset_mask": ended})
+    assert observation["observation"].dtype == np.float32
+    distance = np.linalg.norm(observation["achieved_goal"] - observation["desired_goal"], axis=1)
+    np.testing.assert_allclose(info["distance"], distance, rtol=1e-5)
 
 
-def test_task_gives_the_same_inside_a_compiled_step() -> None:
-    task = midway.make_vec("tests/Reach-v0").goal_spec.task
-    achieved = np.linspace(0, 1, 9, dtype=np.float32)[:, None]
-    desired = np.full((9, 1), 0.5, np.float32)
-    reward, terminated = jax.jit(task)(achieved, desired)
-    assert (np.asarray(terminated) == task(achieved, desired)[1]).all()
-    assert np.asarray(terminated).sum() == 5
-    assert (np.asarray(reward) == -1).all()
+def test_processes_show_what_one_process_shows() -> None:
+    foreign = plane(ends="cliff", word="success")
+    with_processes = ForeignVectorEnv(foreign, 5, num_threads=2)
+    assert with_processes._workers is not None
+    alone = ForeignVectorEnv(foreign, 5, num_threads=1)
+    assert alone._workers is None
+    check_same(run(alone, 60), run(with_processes, 60))
+
+
+def test_a_batch_is_as_many_batches_of_one() -> None:
+    # Ends differ between environments: only what happens before the first end is compared.
+    foreign = plane(ends="own", reward="none", settings=Settings(success_distance=1e-6))
+    together = run(ForeignVectorEnv(foreign, 3), 14)
+    check_same(run(ForeignVectorEnv(foreign, 1), 14, seed=0), together, slice(0, 1))
+    check_same(run(ForeignVectorEnv(foreign, 1), 14, seed=0), run(ForeignVectorEnv(foreign, 1), 14))
+
+
+def test_an_ended_environment_must_be_reset_and_others_are_left_alone() -> None:
+    env = ForeignVectorEnv(plane(ends="own", reward="none", settings=Settings(0.001)), 3)
+    env.reset(seed=0)
+    env.step(np.zeros((3, 2), np.float32))
+    before = env._held["observation"].copy()
+    observation, info = env.reset(options={"reset_mask": np.array([False, True, False])})
+    same = (observation["observation"] == before.astype(np.float32)).all(1)
+    assert same.tolist() == [True, False, True]
+    assert info["elapsed_steps"].tolist() == [1, 0, 1]
+    for _ in range(6):
+        _, _, terminated, truncated, _ = env.step(np.zeros((3, 2), np.float32))
+    assert truncated.tolist() == [True, False, True]
+    assert not terminated.any()
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros((3, 2), np.float32))
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+def test_who_rests_is_not_stepped_until_it_is_reset(num_threads: int) -> None:
+    env = ForeignVectorEnv(plane(Settings(1e-6), reward="none"), 2, num_threads=num_threads)
+    start = env.reset(seed=0)[0]["achieved_goal"]
+    second = np.array([False, True])
+    env.rest(second)
+    for _ in range(20):
+        observation, _, terminated, truncated, _ = env.step(RIGHT)
+    moved = observation["achieved_goal"] - start
+    np.testing.assert_allclose(moved, [[5, 0], [0, 0]], atol=1e-5)
+    assert truncated.tolist() == [True, False]
+    assert not terminated.any()
+    env.reset(options={"reset_mask": np.array([True, True])})
+    before = env._held["achieved_goal"].copy()
+    env.step(RIGHT)
+    assert (env._held["achieved_goal"] != before)[:, 0].all()
+    env.close()
+
+
+def test_an_end_without_success_is_a_failure() -> None:
+    env = ForeignVectorEnv(plane(ends="cliff"), 2)
+    env.reset(seed=1)
+    for _ in range(12):
+        _, _, terminated, truncated, info = env.step(RIGHT)
+        over = np.abs(env._held["achieved_goal"][:, 0]) > 1.5
+        np.testing.assert_array_equal(info["failed"], over & ~info["is_success"])
+        np.testing.assert_array_equal(terminated, info["failed"] | info["is_success"])
+        if info["failed"].any():
+            break
+        if (terminated | truncated).any():
+            env.reset(options={"reset_mask": terminated | truncated})
+    assert info["failed"].any()
+    assert info["_failed"].all()
+
+
+def test_an_end_by_success_is_none_and_by_time_is_truncation() -> None:
+    shown = run(ForeignVectorEnv(plane(ends="success"), 4), 100)
+    assert not any(row["failed"].any() for row in shown if "failed" in row)
+    assert any(row["terminated"].any() for row in shown if "failed" in row)
+    late = describe(fakes.limited, Settings(1e-6), {"ends": "time", "reward": "none"})
+    failed = [row["failed"] for row in run(ForeignVectorEnv(late, 2), 10) if "failed" in row]
+    assert failed[-1].all()
+    # Terminated at the very limit is what older environments say of a time limit.
+    at_limit = run(ForeignVectorEnv(with_limit(late, 10), 2), 10)
+    assert at_limit[-2]["truncated"].all()
+    assert not at_limit[-2]["failed"].any()
+
+
+def test_what_the_environment_calls_success_is_no_failure() -> None:
+    """A stricter rule of the user than the environment's, which ends its episodes."""
+    strict = describe(fakes.limited, Settings(1e-6), {"ends": "success", "word": "success"})
+    shown = [row for row in run(ForeignVectorEnv(strict, 4), 60) if "failed" in row]
+    assert not any(row["failed"].any() or row["terminated"].any() for row in shown)
+    assert any((row["truncated"] & (row["elapsed"] < 20)).any() for row in shown)
+
+
+@pytest.mark.parametrize(
+    ("form", "shape", "read", "dtype"),
+    [
+        ("dict", (), (5,), "float32"),
+        ("same", (), (2,), "float32"),
+        ("image", (84, 84, 3), (84, 84, 3), "uint8"),
+        ("image", (48, 64, 3), (84, 84, 3), "uint8"),
+        ("image", (3, 120, 160), (84, 84, 3), "uint8"),
+        ("image", (200, 100), (84, 84, 3), "uint8"),
+    ],
+)
+def test_observations_of_every_form(form: str, shape: Any, read: Any, dtype: str) -> None:
+    foreign = describe(fakes.Seen, None, {"form": form, "shape": shape})
+    assert foreign.spec.observation_shape == read
+    assert foreign.spec.observation_dtype == dtype
+    assert foreign.spec.goal_is_observation == (form == "same")
+    env = ForeignVectorEnv(foreign, 2)
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    if form == "image":
+        assert (observation["observation"] == 100).all()
+
+
+def test_an_image_is_shrunk_by_means_over_its_pixels() -> None:
+    from midway.envs.reading import readings
+
+    goal = spaces.Box(-1, 1, (1,), np.float64)
+    box = spaces.Box(0, 255, (168, 168, 1), np.uint8)
+    space = spaces.Dict({"observation": box, "achieved_goal": goal, "desired_goal": goal})
+    pixels = np.random.default_rng(0).integers(0, 256, (168, 168, 1), np.uint8)
+    small = readings("x", space)["observation"].read(pixels)
+    means = pixels.reshape(84, 2, 84, 2).mean((1, 3))
+    assert np.abs(small - means[..., None]).max() <= 0.501
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"observation": spaces.Box(0, 255, (84, 84, 4), np.uint8)}, "images of 4 channels"),
+        ({"achieved_goal": spaces.Discrete(3)}, "achieved_goal must be numbers"),
+        ({"desired_goal": spaces.Box(-1, 1, (5,))}, "must have the same shape"),
+        (
+            dict.fromkeys(
+                ("achieved_goal", "desired_goal"), spaces.Box(0, 255, (84, 84), np.uint8)
+            ),
+            "its goals are images.*observe achieved_state",
+        ),
+        ({"observation": spaces.Sequence(spaces.Discrete(2))}, "no fixed number of entries"),
+    ],
+)
+def test_what_cannot_be_read_is_refused(change: dict[str, Any], reason: str) -> None:
+    def made() -> Any:
+        env = fakes.limited()
+        env.unwrapped.observation_space = spaces.Dict({**env.observation_space.spaces, **change})
+        return env
+
+    with pytest.raises(ConfigurationError, match=reason):
+        describe(made)
+
+
+@pytest.mark.parametrize(
+    ("space", "reason"),
+    [
+        (spaces.Discrete(4), r"its actions are Discrete\(4\)"),
+        (spaces.MultiBinary(4), r"its actions are MultiBinary\(4\)"),
+        (spaces.Box(-np.inf, np.inf, (2,)), "no bounds: give --action-bound B"),
+    ],
+)
+def test_actions_that_are_no_numbers_within_bounds_are_refused(space: Any, reason: str) -> None:
+    def made() -> Any:
+        env = fakes.limited()
+        env.unwrapped.action_space = space
+        return env
+
+    with pytest.raises(ConfigurationError, match=reason):
+        describe(made)
+    if isinstance(space, spaces.Box):
+        env = ForeignVectorEnv(describe(made, Settings(action_bound=4.0)), 1)
+        start = env.reset(seed=0)[0]["achieved_goal"]
+        moved = env.step(np.array([[1, -0.5]], np.float32))[0]["achieved_goal"] - start
+        np.testing.assert_allclose(moved, [[1, -0.5]], atol=1e-6)
+
+
+def test_what_is_not_finite_stops_with_its_name() -> None:
+    with pytest.raises(ConfigurationError, match=r"observation\[0\] is nan after 3 steps"):
+        plane(broken_at=3)
+    broken = Foreign(source(fakes.limited, {"broken_at": 3}), plane(Settings(1e-6)).spec)
+    env = ForeignVectorEnv(broken, 2)
+    env.reset(seed=0)
+    env.step(0 * RIGHT)
+    env.step(0 * RIGHT)
+    with pytest.raises(NonFiniteError, match="observation of environment 0 is not finite"):
+        env.step(0 * RIGHT)
+
+
+def test_all_that_was_decided_can_be_stored() -> None:
+    foreign = plane(Settings(success_function=fakes.within, action_bound=2.0), word="success")
+    again = Foreign.from_json(json.loads(json.dumps(foreign.to_json())))
+    assert again.spec == foreign.spec
+    assert again.source == foreign.source
+    assert again.settings.success_function == "fakes:within"
+    assert not again.rule_is_its_own
+    check_same(run(ForeignVectorEnv(foreign, 2), 20), run(ForeignVectorEnv(again, 2), 20))
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        Foreign.from_json({"source": {}})
+
+
+def test_pictures_of_the_environments() -> None:
+    env = ForeignVectorEnv(plane(), 2, render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(RIGHT)
+    pictures = env.render()
+    assert pictures is not None
+    assert [picture.mean() for picture in pictures] == [1, 1]
+    assert ForeignVectorEnv(plane(), 2).render() is None
+
+
+SCRIPT = """
+import sys, time
+import numpy as np, gymnasium
+sys.path.insert(0, {folder!r})
+import fakes
+from midway.envs.foreign import ForeignVectorEnv, describe
+
+class Mine(fakes.Plane):
+    "A class of the script itself, which no process can import."
+
+def make():
+    return gymnasium.wrappers.TimeLimit(Mine(), 20)
+
+env = ForeignVectorEnv(describe(make), 4, num_threads=2)
+env.reset(seed=0)
+print(*[process.pid for process in env._workers._vector.processes], flush=True)
+input()
+{end}
+"""
+
+
+def start(end: str) -> tuple[subprocess.Popen[str], list[int]]:
+    """Run a script without ``if __name__``; return it and the processes that it started."""
+    text = SCRIPT.format(folder=str(Path(fakes.__file__).parent), end=textwrap.dedent(end))
+    script = subprocess.Popen(
+        [sys.executable, "-c", text], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert script.stdout is not None
+    return script, [int(pid) for pid in script.stdout.readline().split()]
+
+
+def alive(pids: list[int]) -> list[int]:
+    """Return which of the processes still run, after a while in which they may end."""
+    for _ in range(100):
+        running = [pid for pid in pids if Path(f"/proc/{pid}").exists()]
+        if not running:
+            return []
+        time.sleep(0.1)
+    return running
+
+
+@pytest.mark.parametrize("end", ["env.close()", "", "raise SystemExit(0)"])
+def test_processes_end_with_the_script_and_leave_signals_to_it(end: str) -> None:
+    script, workers = start("env.step(np.zeros((4, 2), np.float32))\n" + end)
+    assert len(workers) == 2
+    for pid in workers:  # as Ctrl-C, timeout and job schedulers do: everyone gets the signal
+        os.kill(pid, signal.SIGTERM)
+        os.kill(pid, signal.SIGINT)
+    script.communicate("\n", timeout=60)
+    assert script.returncode == 0
+    assert alive(workers) == []
+
+
+def test_processes_end_when_the_script_is_killed() -> None:
+    script, workers = start("")
+    script.kill()
+    script.communicate(timeout=60)
+    assert alive(workers) == []
+
+
+def test_a_process_that_is_gone_is_told() -> None:
+    env = ForeignVectorEnv(plane(), 2, num_threads=2)
+    env.reset(seed=0)
+    assert env._workers is not None
+    victim = env._workers._vector.processes[0]
+    victim.kill()
+    victim.join()
+    with pytest.raises(RuntimeError, match="a process that steps environments has ended"):
+        env.step(RIGHT)
+    env.close()
 
 
 @pytest.mark.parametrize("agent", ["ris", "sac"])
 def test_train_resume_and_evaluate(tmp_path: Path, agent: str) -> None:
-    """RIS predicts pairs of observation and achieved goal here, of sizes 2 and 1."""
-    run = midway.train("tests/Reach-v0", agent=agent, steps=60, out=tmp_path / "run", changes=TINY)
-    assert run.finished
-    assert midway.resume(run.path, steps=120).finished
-    result = midway.evaluate(run.path, episodes=3, task="uniform")
+    """RIS predicts pairs of observation and achieved goal here, of sizes 4 and 2."""
+    name = "tests/Reach-v0"
+    made = midway.train(name, agent=agent, steps=60, out=tmp_path / "run", changes=TINY)
+    assert made.finished
+    assert midway.resume(made.path, steps=120).finished
+    result = midway.evaluate(made.path, episodes=3, task="uniform")
     assert len(result.episodes) == 3
-    action = midway.load(run.path)(np.zeros(2, np.float32), np.zeros(1, np.float32))
-    assert action.shape == (1,)
+    action = midway.load(made.path)(np.zeros(4, np.float32), np.zeros(2, np.float32))
+    assert action.shape == (2,)
 
 
-def test_what_is_no_goal_environment_is_refused() -> None:
+def test_what_is_no_environment_is_refused_by_name() -> None:
     with pytest.raises(ConfigurationError, match="no goal environment"):
         midway.make_vec("Pendulum-v1")
-    with pytest.raises(ConfigurationError, match="unknown environment"):
+    with pytest.raises(ConfigurationError, match=r"unknown environment 'Nowhere-v0'.*point-u"):
         midway.make_vec("Nowhere-v0")
+
+
+def test_what_was_described_goes_by_its_name() -> None:
+    foreign = describe(lambda: fakes.limited(), Settings(0.7))
+    assert midway.make_vec(foreign).goal_spec == foreign.spec
+    admit(foreign)
+    assert midway.make_vec(foreign.spec.name).goal_spec.task.threshold == 0.7

@@ -1,161 +1,431 @@
-"""Any Gymnasium environment that follows the goal API, by its own id.
+"""Goal environments that are not midway's: described once, stepped by their own simulators.
 
-Such an environment has the observation keys ``observation``, ``achieved_goal`` and ``desired_goal``
-and a method ``compute_reward(achieved_goal, desired_goal, info)``. Training rewards it as the paper
-does: -1 on every step, terminated where its own reward says that the goal is reached.
+Such an environment observes a dictionary of ``observation``, ``achieved_goal`` and
+``desired_goal``. Training rewards it as the paper does: -1 on every step, until its goal is
+reached by the rule that ``deciding.py`` finds.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
+import functools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import Int, Shaped
+from jaxtyping import Bool, Int, Shaped
 
-from midway.envs.vector import Array, GoalVectorEnv, Observations
-from midway.errors import ConfigurationError
-from midway.types import ArrayLike, EnvSpec
+from midway.envs import deciding, success
+from midway.envs.group import Group
+from midway.envs.probes import Probes, probe
+from midway.envs.reading import readings
+from midway.envs.simulation import num_cores
+from midway.envs.sources import Source, source
+from midway.envs.success import Rule, judge, reference_of
+from midway.envs.vector import Array, GoalVectorEnv, Observations, Step
+from midway.envs.workers import Workers
+from midway.errors import ConfigurationError, NonFiniteError
+from midway.types import EnvSpec
 
-DEFAULT_EPISODE_STEPS = 1000
-"""Steps of an episode where the environment was registered without a limit."""
+CHEAP_SECONDS = 0.002
+"""Environments whose steps take less time together are stepped without other processes."""
+CONTRADICTIONS = 3
+"""So many moments in which info contradicts the rule are no matter of rounding."""
 
 
 @dataclass(frozen=True)
-class RewardTask:
-    """Success as the environment's own sparse reward has it: where that is not negative.
+class Settings:
+    """What a user may say of an environment that is not midway's.
 
     Attributes:
-        gym_id: Id of the environment.
+        success_distance: Distance between the goals below which one counts as reached.
+        success_function: ``module:function`` of achieved and desired goals that says so.
+        max_episode_steps: Steps of an episode, in place of the registered limit.
+        action_bound: Bounds of actions that have none.
     """
 
-    gym_id: str
+    success_distance: float | None = None
+    success_function: str | Callable[..., Any] | None = None
+    max_episode_steps: int | None = None
+    action_bound: float | None = None
 
-    def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
-        """Return the Euclidean distance between the goals ``(B,)``, in their own unit."""
-        return (((achieved - desired) ** 2).sum(-1)) ** 0.5
 
-    def __call__(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
-        """Return reward ``(B,)``, always -1, and terminated ``(B,)``.
+@dataclass(frozen=True)
+class Foreign:
+    """An environment that is not midway's, with all that was decided about it.
 
-        Inside a compiled step the environment is asked on the host.
+    Attributes:
+        source: What makes it.
+        spec: What agents may know of it; its task is the rule of success.
+        settings: What the user said of it.
+        seconds: Median time of one of its steps, where it was measured.
+    """
+
+    source: Source
+    spec: EnvSpec
+    settings: Settings = Settings()
+    seconds: float = field(default=math.inf, compare=False)
+
+    @property
+    def rule(self) -> Rule:
+        """The rule of success."""
+        rule: Any = self.spec.task
+        return rule  # type: ignore[no-any-return]
+
+    @property
+    def rule_is_its_own(self) -> bool:
+        """Whether the rule is the environment's, which its info must not contradict."""
+        given = (self.settings.success_distance, self.settings.success_function)
+        return given == (None, None)
+
+    @property
+    def description(self) -> str:
+        """What counts as success, as one line for the user."""
+        return f"{self.spec.name}: a goal is reached {self.rule.description}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a run folder stores.
+
+        Raises:
+            ConfigurationError: No other process could make the environment or find its rule.
         """
-        if isinstance(achieved, np.ndarray):
-            reached = self._reached(achieved, desired)
-            return np.full(reached.shape, -1, np.float32), reached
-        import jax
-        import jax.numpy as jnp
+        stored = {"source": self.source.to_json(), "success": self.rule.to_json()}
+        settings = asdict(self.settings)
+        function = self.settings.success_function
+        if function is not None and not isinstance(function, str):
+            settings["success_function"] = reference_of(function)[0]
+        spec = {k: v for k, v in vars(self.spec).items() if k not in ("task", "origin", "unit")}
+        return stored | {"settings": settings, "spec": spec}
 
-        shape = jax.ShapeDtypeStruct(achieved.shape[:-1], jnp.bool_)  # type: ignore[no-untyped-call]
-        reached = jax.pure_callback(self._reached, shape, achieved, desired)
-        return jnp.full(achieved.shape[:-1], -1.0, jnp.float32), reached
+    @staticmethod
+    def from_json(stored: Mapping[str, Any]) -> "Foreign":
+        """Return the environment that ``to_json`` was taken from; nothing is decided again.
 
-    def _reached(self, achieved: ArrayLike, desired: ArrayLike) -> Array:
-        env: Any = _judge(self.gym_id)
-        pairs = zip(np.asarray(achieved), np.asarray(desired), strict=True)
-        return np.array([float(env.compute_reward(*pair, {})) >= 0 for pair in pairs], np.bool_)
+        Raises:
+            ConfigurationError: It is none.
+        """
+        try:
+            shapes = ("observation_shape", "goal_shape", "state_shape")
+            spec: dict[str, Any] = {
+                name: tuple(value) if name in shapes and value is not None else value
+                for name, value in stored["spec"].items()
+            }
+            task = success.from_json(stored["success"])
+            return Foreign(
+                source=Source.from_json(stored["source"]),
+                spec=EnvSpec(**spec, task=task),
+                settings=Settings(**stored["settings"]),
+            )
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ConfigurationError(f"stored environment cannot be read: {error}") from error
 
 
-@cache
-def _judge(gym_id: str) -> Any:
-    """Return one copy of the environment that only judges goals."""
-    return gymnasium.make(gym_id).unwrapped
+def describe(
+    env: Any,
+    settings: Settings | None = None,
+    kwargs: Mapping[str, Any] | None = None,
+    imports: tuple[str, ...] = (),
+) -> Foreign:
+    """Return an environment with all that must be decided about it; a few episodes are run.
+
+    Args:
+        env: A name, a callable that makes environments, or what ``gymnasium.make`` returned.
+        settings: What the user says of it.
+        kwargs: Keyword arguments of the environment.
+        imports: Modules to import first.
+
+    Raises:
+        ConfigurationError: It cannot be made, is no goal environment, has no limit, or does not
+            say when a goal is reached; the text says what to give.
+    """
+    settings = settings or Settings()
+    origin = source(env, kwargs, imports)
+    name = origin.reference
+    made = judge(origin)
+    read = readings(name, made.observation_space)
+    actions = _checked_actions(name, made.action_space, settings.action_bound)
+    limit = _limit(name, made, settings.max_episode_steps)
+    other = origin.make(limit)
+    try:
+
+        def probes(seed: int, steps: int) -> Probes:
+            return probe(name, other, read, settings.action_bound, limit, seed, steps)
+
+        seen = probe(name, other, read, settings.action_bound, limit)
+        kind = "state" if "achieved_state" in read else "goal"
+        evidence = deciding.Evidence(
+            name=name,
+            source=origin,
+            judge=made,
+            env=other,
+            goal_shape=made.observation_space[f"desired_{kind}"].shape,
+            probes=seen,
+            more=lambda seed: probes(seed, 10 * len(seen.word)),
+        )
+        given = settings.success_distance, settings.success_function
+        rule = deciding.given(evidence, *given) or deciding.own(evidence)
+    finally:
+        other.close()
+    spec = EnvSpec(
+        name=name,
+        observation_shape=read["observation"].shape,
+        observation_dtype=read["observation"].dtype,
+        goal_shape=read["desired_goal"].shape,
+        action_dim=int(np.prod(actions.shape)),
+        max_episode_steps=limit,
+        goal_is_observation=seen.goal_is_observation,
+        state_shape=read["desired_state"].shape if kind == "state" else None,
+        task=rule,
+    )
+    return Foreign(origin, spec, settings, seen.seconds)
+
+
+_ADMITTED: dict[str, Foreign] = {}
+
+
+def admit(foreign: Foreign) -> Foreign:
+    """Let an environment go by its name in this process, also one that only an object makes."""
+    _ADMITTED[foreign.spec.name] = foreign
+    return foreign
+
+
+def described(name: str) -> Foreign:
+    """Return the environment that was admitted by this name, else describe and admit it.
+
+    Raises:
+        ConfigurationError: As `describe`.
+    """
+    return _ADMITTED.get(name) or admit(describe(name))
 
 
 class ForeignVectorEnv(GoalVectorEnv):
-    """Copies of a Gymnasium goal environment, stepped one after the other.
+    """Environments that are not midway's, stepped together in a few processes.
 
-    Its simulator cannot be saved: after `midway resume` all copies begin new episodes. Actions in
-    [-1, 1] are scaled to the environment's bounds.
+    Their simulators cannot be saved: after ``midway resume`` all begin new episodes. Info has
+    ``failed``: where the environment ended its episode without success, for which ``step`` returns
+    terminated too; ``is_success`` tells them apart. What cuts an episode short is truncated.
 
     Args:
-        gym_id: Id of the environment.
-        num_envs: Number of copies.
+        foreign: The environment.
+        num_envs: Number of environments.
         task: ``uniform``: the environment's own distribution of starts and goals.
-        num_threads: Not used.
+        num_threads: Processes that step; 1: this one alone; 0 chooses. Results do not depend on it.
+        render_mode: Gymnasium's, such as ``rgb_array``: ``render`` then returns pictures.
 
     Raises:
-        ConfigurationError: The environment does not follow the goal API, or cannot be made.
+        ConfigurationError: The environment cannot be made, or ``num_envs`` is not positive.
     """
 
     resumable = False
 
     def __init__(
-        self, gym_id: str, num_envs: int = 1, task: str = "uniform", num_threads: int = 0
+        self,
+        foreign: Foreign,
+        num_envs: int = 1,
+        task: str = "uniform",
+        num_threads: int = 0,
+        render_mode: str | None = None,
     ) -> None:
-        copies: list[Any] = [_make(gym_id) for _ in range(num_envs)]
-        space = _checked_space(gym_id, copies[0])
-        self._actions = copies[0].action_space
-        limit = getattr(copies[0].spec, "max_episode_steps", None) or DEFAULT_EPISODE_STEPS
-        spec = EnvSpec(
-            name=gym_id,
-            observation_shape=space["observation"].shape or (),
-            observation_dtype="float32",
-            goal_shape=space["achieved_goal"].shape or (),
-            action_dim=int(np.prod(self._actions.shape)),
-            max_episode_steps=limit,
-            goal_is_observation=False,
-            state_shape=None,
-            task=RewardTask(gym_id),
+        self.foreign = foreign
+        made = judge(foreign.source)
+        read = readings(foreign.spec.name, made.observation_space)
+        state = read.get("desired_state")
+        boxes = [_as_float32(read[name].box()) for name in ("observation", "desired_goal")]
+        super().__init__(
+            foreign.spec,
+            num_envs,
+            ("uniform",),
+            task,
+            *boxes,
+            state_box=None if state is None else _as_float32(state.box()),
         )
-        boxes = [_as_float32(space[name]) for name in ("observation", "achieved_goal")]
-        super().__init__(spec, num_envs, ("uniform",), task, *boxes)
-        self._copies = copies
-        self._newest: list[Mapping[str, Any]] = [{}] * num_envs
+        self.render_mode = render_mode
+        make_group = functools.partial(
+            Group,
+            foreign.source,
+            (made.observation_space, made.action_space),
+            total=num_envs,
+            max_episode_steps=foreign.spec.max_episode_steps,
+            action_bound=foreign.settings.action_bound,
+            render_mode=render_mode,
+        )
+        count = self._num_processes(num_threads)
+        self._group = make_group(first=0, size=num_envs) if count == 1 else None
+        self._workers = None if count == 1 else Workers(make_group, num_envs, count)
+        self._held: dict[str, Array] = {}
+        self._newest: Observations = {}
+        self._contradictions = 0
+        self._resting = np.zeros(num_envs, np.bool_)
+
+    def rest(self, mask: Bool[Array, " num_envs"]) -> None:
+        """Step these no more until they are reset: simulators of others can be slow.
+
+        They show what they last showed, and their episodes have no further ends.
+        """
+        self._resting |= mask
+        self._ended &= ~mask
+
+    def step(self, actions: Array) -> Step:
+        """Move every environment by one step, as `GoalVectorEnv.step`.
+
+        Raises:
+            ConfigurationError: The environment's info contradicts its rule of success.
+            NonFiniteError: What it observes is not finite.
+        """
+        observations, reward, _, truncated, info = super().step(actions)
+        reached, ended = info["is_success"], self._held["terminated"] == 1
+        # What its info calls success ends no episode as a failure, whatever the rule of the user.
+        failed = ended & ~reached & (self._held["word"] != 1) & ~truncated
+        truncated = truncated | (self._held["truncated"] == 1) | (ended & ~reached & ~failed)
+        awake = ~self._resting
+        truncated, failed = truncated & awake, failed & awake
+        terminated = (reached | failed) & awake
+        self._ended = terminated | truncated
+        info |= {"failed": failed.copy(), "_failed": info["_is_success"].copy()}
+        return observations, reward, terminated, truncated, info
+
+    def success_pair(self, observations: Mapping[str, Array]) -> tuple[Array, Array]:
+        """Return what success is measured on: as exactly as the environment knows it, if newest."""
+        if observations is not self._newest:
+            return super().success_pair(observations)
+        kind = "goal" if self.goal_spec.state_shape is None else "state"
+        return self._held[f"achieved_{kind}"], self._held[f"desired_{kind}"]
+
+    def render(self) -> tuple[Any, ...] | None:
+        """Return a picture of each environment; only with a render mode and one process."""
+        return tuple(self._group.render()) if self._group and self.render_mode else None
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End the processes and close the environments."""
+        if getattr(self, "_workers", None) is not None:
+            self._workers.close()  # type: ignore[union-attr]
+        if getattr(self, "_group", None) is not None:
+            self._group.close()  # type: ignore[union-attr]
 
     def _begin(self, copies: Int[Array, " n"], options: Mapping[str, Any]) -> None:
+        mask, seeds = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.int64)
         for copy in copies:
-            seed = int(self.generators[copy].integers(2**31))
-            self._newest[copy] = self._copies[copy].reset(seed=seed)[0]
+            mask[copy], seeds[copy] = True, self.generators[copy].integers(2**31)
+        self._resting &= ~mask
+        if self._workers is not None:
+            self._hold(self._workers.reset(mask, seeds))
+        elif self._group is not None:
+            self._hold(self._group.reset(options={"mask": mask, "seeds": seeds})[0])
 
     def _advance(self, actions: Shaped[Array, "num_envs action_dim"]) -> None:
-        low, high = self._actions.low, self._actions.high
-        for copy, action in enumerate(np.clip(actions, -1, 1)):
-            scaled = low + (action.reshape(low.shape) + 1) / 2 * (high - low)
-            self._newest[copy] = self._copies[copy].step(scaled.astype(self._actions.dtype))[0]
+        actions = np.where(self._resting[:, None], np.nan, actions).astype(np.float32)
+        if self._workers is not None:
+            self._hold(self._workers.step(actions))
+        elif self._group is not None:
+            self._hold(self._group.step(actions)[0])
+
+    def _hold(self, shown: Mapping[str, Array]) -> None:
+        """Keep what the environments show, apart from the memory that they share.
+
+        Raises:
+            NonFiniteError: Something is not finite.
+        """
+        self._held = {name: batch.copy() for name, batch in shown.items()}
+        for name in self.single_observation_space:
+            batch = self._held[name]
+            if batch.dtype != np.uint8 and not np.isfinite(batch).all():
+                copy = int(np.flatnonzero(~np.isfinite(batch.reshape(self.num_envs, -1)).all(1))[0])
+                raise NonFiniteError(
+                    f"{self.goal_spec.name}: {name} of environment {copy} is not finite"
+                )
 
     def _observe(self) -> Observations:
-        names = ("observation", "achieved_goal", "desired_goal")
-        shapes = {name: self.single_observation_space[name].shape for name in names}
-        nothing = {name: np.zeros(shape or (), np.float32) for name, shape in shapes.items()}
-        newest = [{**nothing, **observation} for observation in self._newest]
-        return {name: np.stack([o[name] for o in newest]).astype(np.float32) for name in names}
+        boxes: Any = self.single_observation_space
+        self._newest = {name: self._held[name].astype(box.dtype) for name, box in boxes.items()}
+        return self._newest
 
-    def close(self, **kwargs: Any) -> None:
-        """Close every copy."""
-        for copy in self._copies:
-            copy.close()
+    def _info(
+        self, achieved: Array, desired: Array, reached: Array, mask: Bool[Array, " num_envs"]
+    ) -> dict[str, Any]:
+        reached = self._as_it_says(achieved, desired, reached)
+        return super()._info(achieved, desired, reached, mask)
+
+    def _as_it_says(self, achieved: Array, desired: Array, reached: Array) -> Array:
+        """Return success as the environment's info says, where the rule is the environment's.
+
+        Raises:
+            ConfigurationError: Info contradicts the rule.
+        """
+        word = self._held["word"]
+        if not self.foreign.rule_is_its_own:
+            return reached
+        wrong = (word >= 0) & (word != reached)
+        self._contradictions += int(wrong.sum())
+        if self._contradictions >= CONTRADICTIONS:
+            copy = int(np.flatnonzero(wrong)[0]) if wrong.any() else 0
+            distance = float(np.linalg.norm(achieved[copy] - desired[copy]))
+            raise ConfigurationError(
+                f"{self.goal_spec.name}: its info says success {bool(word[copy])} at distance "
+                f"{distance:.4g}, but a goal counts as reached {self.foreign.rule.description}: "
+                f"success is not a matter of the two goals alone; {deciding.REMEDY}"
+            )
+        return np.where(word >= 0, word == 1, reached)
+
+    def _num_processes(self, wanted: int) -> int:
+        """Return how many processes step; 1: this one alone."""
+        together = self.foreign.seconds * self.num_envs
+        if self.num_envs == 1 or self.render_mode or (wanted == 0 and together < CHEAP_SECONDS):
+            return 1
+        return min(wanted or num_cores(), self.num_envs)
 
 
-def _make(gym_id: str) -> Any:
-    try:
-        return gymnasium.make(gym_id, disable_env_checker=True)
-    except (gymnasium.error.Error, ImportError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigurationError(f"environment {gym_id} cannot be made: {reason}") from error
+def with_limit(foreign: Foreign, max_episode_steps: int) -> Foreign:
+    """Return the same environment with another number of steps in an episode."""
+    settings = replace(foreign.settings, max_episode_steps=max_episode_steps)
+    spec = replace(foreign.spec, max_episode_steps=max_episode_steps)
+    return replace(foreign, spec=spec, settings=settings)
 
 
-def _checked_space(gym_id: str, env: Any) -> Any:
-    """Return the observation space of a goal environment with continuous actions.
+def _checked_actions(name: str, space: gymnasium.Space[Any], bound: float | None) -> spaces.Box:
+    """Return the space of continuous actions.
 
     Raises:
-        ConfigurationError: It is none.
+        ConfigurationError: They are discrete or have no bounds.
     """
-    space = env.observation_space
-    keys = {"observation", "achieved_goal", "desired_goal"}
-    if not isinstance(space, spaces.Dict) or not keys <= set(space):
-        raise ConfigurationError(f"{gym_id} is no goal environment: it must observe {sorted(keys)}")
-    if any(not isinstance(space[key], spaces.Box) or len(space[key].shape) != 1 for key in keys):  # type: ignore[arg-type]
-        raise ConfigurationError(f"{gym_id}: observation and goals must be vectors of numbers")
-    if not hasattr(env.unwrapped, "compute_reward"):
-        raise ConfigurationError(f"{gym_id} is no goal environment: it has no compute_reward")
-    actions = env.action_space
-    if not isinstance(actions, spaces.Box) or not actions.is_bounded():
-        raise ConfigurationError(f"{gym_id}: actions must be numbers within bounds")
+    if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating):
+        raise ConfigurationError(
+            f"{name}: its actions are {space}: midway's agents choose numbers within bounds (a Box "
+            "of floats)"
+        )
+    if bound is not None and not 0 < bound < np.inf:
+        raise ConfigurationError(f"action_bound {bound}: must be positive")
+    if bound is None and not space.is_bounded():
+        raise ConfigurationError(f"{name}: its actions have no bounds: give --action-bound B")
     return space
 
 
-def _as_float32(box: Any) -> spaces.Box:
-    return spaces.Box(box.low.astype(np.float32), box.high.astype(np.float32), dtype=np.float32)
+def _limit(name: str, env: Any, given: int | None) -> int:
+    """Return the number of steps of an episode.
+
+    Raises:
+        ConfigurationError: None is registered nor given.
+    """
+    if given is not None:
+        if given < 1:
+            raise ConfigurationError(f"max_episode_steps {given}: must be at least 1")
+        return given
+    registered = getattr(env.spec, "max_episode_steps", None)
+    limit = registered or _wrapped_limit(env)
+    if limit is None:
+        raise ConfigurationError(
+            f"{name}: its episodes have no limit of steps: give --max-episode-steps N"
+        )
+    return int(limit)
+
+
+def _wrapped_limit(env: Any) -> int | None:
+    try:
+        return int(env.get_wrapper_attr("_max_episode_steps"))
+    except (AttributeError, TypeError, ValueError):
+        return None
+
+
+def _as_float32(box: spaces.Box) -> spaces.Box:
+    dtype: Any = np.uint8 if box.dtype == np.uint8 else np.float32
+    return spaces.Box(box.low.astype(dtype), box.high.astype(dtype), dtype=dtype)

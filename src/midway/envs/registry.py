@@ -12,6 +12,7 @@ from midway.envs.views import MazeView, TableView, View
 from midway.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from midway.envs.foreign import Foreign
     from midway.envs.vector import GoalVectorEnv
 
 
@@ -110,37 +111,41 @@ def register_ids() -> None:
         )
 
 
-def entry(name: str) -> Declaration:
-    """Return the declaration of an environment; Gymnasium goal environments go by their own id.
+def entry(env: "str | Foreign") -> Declaration:
+    """Return the declaration of an environment, by its name or as `foreign.describe` returned it.
 
     Raises:
-        ConfigurationError: There is none of this name.
+        ConfigurationError: There is none of this name, or midway cannot use it.
     """
-    if name in ENVIRONMENTS:
-        return ENVIRONMENTS[name]
-    if name in gymnasium.registry:
-        return Declaration(
-            name=name,
-            gym_id=name,
-            family="other",
-            description="registered with Gymnasium",
-            tasks=("uniform",),
-            entry_point="midway.envs.foreign:ForeignVectorEnv",
-            arguments={"gym_id": name},
-        )
-    raise ConfigurationError(
-        f"unknown environment {name!r}: use one of {', '.join(ENVIRONMENTS)}, or the Gymnasium id "
-        "of a goal environment"
+    if isinstance(env, str) and env in ENVIRONMENTS:
+        return ENVIRONMENTS[env]
+    from midway.envs import foreign, sources
+
+    try:
+        described = foreign.described(env) if isinstance(env, str) else env
+    except sources.UnknownEnvironmentError as error:
+        raise ConfigurationError(
+            f"{error}; midway's own are {', '.join(ENVIRONMENTS)}, and any goal environment goes "
+            "by its Gymnasium id or module:name"
+        ) from error
+    return Declaration(
+        name=described.spec.name,
+        gym_id=described.source.reference,
+        family="other",
+        description=described.rule.description,
+        tasks=("uniform",),
+        entry_point="midway.envs.foreign:ForeignVectorEnv",
+        arguments={"foreign": described},
     )
 
 
 def make_vec(
-    name: str, num_envs: int = 1, task: str = "uniform", num_threads: int = 0
+    name: "str | Foreign", num_envs: int = 1, task: str = "uniform", num_threads: int = 0
 ) -> "GoalVectorEnv":
     """Return environments that are stepped together.
 
     Args:
-        name: A name of the registry, such as ``point-u``.
+        name: A name of the registry, such as ``point-u``, or what ``foreign.describe`` returned.
         num_envs: Number of environments.
         task: A task of the environment: what starts and goals are drawn from.
         num_threads: Threads that simulate; 0 chooses. Results do not depend on it.

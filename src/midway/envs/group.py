@@ -1,0 +1,127 @@
+"""Several environments that are not midway's, stepped one after the other by one process."""
+
+import os
+import signal
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from midway.envs.reading import Array, Reading, readings, word_of
+from midway.envs.sources import Source, printing_to_stderr
+
+FLAGS = ("terminated", "truncated", "word")
+"""What each environment said of its last step; ``word``: of success, -1 where it said nothing."""
+
+
+class Group(gymnasium.Env[dict[str, Array], Array]):
+    """Some of the environments of a vector environment, as if they were one.
+
+    One process steps a group. Everything travels in the observation, and so through the memory
+    that ``AsyncVectorEnv`` shares. ``reset`` takes ``options``: ``mask`` and ``seeds`` of every
+    environment of all groups; the environments themselves are made when they are first reset.
+
+    Args:
+        source: What makes the environments.
+        spaces_of: Observation and action space of one of them.
+        first: Number of this group's first environment.
+        size: Number of places of the group.
+        total: Number of environments of all groups.
+        max_episode_steps: Limit in place of the registered one.
+        action_bound: Bounds of actions that have none.
+        render_mode: Gymnasium's.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(
+        self,
+        source: Source,
+        spaces_of: tuple[spaces.Space[Any], spaces.Box],
+        first: int,
+        size: int,
+        total: int,
+        max_episode_steps: int | None = None,
+        action_bound: float | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        self.source, self.render_mode = source, render_mode
+        self.places = range(first, min(first + size, total))
+        self.limit = max_episode_steps
+        self.readings: dict[str, Reading] = readings(source.reference, spaces_of[0])
+        self.low, self.high = action_bounds(spaces_of[1], action_bound)
+        boxes: dict[str, spaces.Space[Any]] = {
+            name: reading.box(size) for name, reading in self.readings.items()
+        }
+        flags = {name: spaces.Box(-1, 1, (size,), np.int8) for name in FLAGS}
+        shown = spaces.Dict(boxes | flags)
+        self.observation_space: spaces.Space[Any] = shown
+        self.action_space = spaces.Box(-1, 1, (size, self.low.size), np.float32)
+        self.envs: list[Any] = []
+        self.held: dict[str, Array] = {
+            name: np.zeros(box.shape or (), box.dtype) for name, box in shown.items()
+        }
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Start new episodes in the environments of the mask."""
+        mask, seeds = (options or {})["mask"], (options or {})["seeds"]
+        if not self.envs:
+            make = self.source.make
+            self.envs = [make(self.limit, self.render_mode) for _ in self.places]
+        for place, index in enumerate(self.places):
+            if mask[index]:
+                with printing_to_stderr():
+                    observation, info = self.envs[place].reset(seed=int(seeds[index]))
+                self._hold(place, observation, info, False, False)
+        return self.held, {}
+
+    def step(self, actions: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+        """Move every environment by one step, by actions in [-1, 1]; NaN: it rests."""
+        scaled = self.low + (np.clip(actions, -1, 1) + 1) / 2 * (self.high - self.low)
+        for place, env in enumerate(self.envs):
+            if np.isnan(scaled[place]).any():
+                self._flag(place, False, False, -1)
+                continue
+            action = scaled[place].reshape(env.action_space.shape).astype(env.action_space.dtype)
+            observation, _, terminated, truncated, info = env.step(action)
+            self._hold(place, observation, info, terminated, truncated)
+        return self.held, 0.0, False, False, {}
+
+    def render(self) -> list[Any]:  # type: ignore[override]
+        """Return a picture of each environment."""
+        return [env.render() for env in self.envs]
+
+    def close(self) -> None:
+        """Close every environment."""
+        for env in self.envs:
+            env.close()
+        self.envs = []
+
+    def work_alone(self) -> None:
+        """Leave signals to the process that trains, which ends this one when it is done."""
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, signal.SIG_IGN)
+        os.dup2(2, 1)
+
+    def _hold(
+        self, place: int, observation: Mapping[str, Any], info: Mapping[str, Any], *ends: bool
+    ) -> None:
+        for name, reading in self.readings.items():
+            self.held[name][place] = reading.read(observation[name])
+        self._flag(place, *ends, word_of(info)[1])
+
+    def _flag(self, place: int, *flags: int) -> None:
+        for name, value in zip(FLAGS, flags, strict=True):
+            self.held[name][place] = value
+
+
+def action_bounds(space: spaces.Box, bound: float | None) -> tuple[Array, Array]:
+    """Return the flat bounds of actions; those that are not finite are at ``bound``."""
+    low, high = (np.asarray(side, np.float64).ravel() for side in (space.low, space.high))
+    if bound is None:
+        return low, high
+    return np.where(np.isfinite(low), low, -bound), np.where(np.isfinite(high), high, bound)
