@@ -18,7 +18,6 @@ import optax
 from jaxtyping import Array, Float, Int, Key, PyTree, Shaped, UInt8
 
 from midway.agent import Encoder, PretrainSettings
-from midway.envs import registry as environments
 from midway.errors import ConfigurationError
 from midway.networks.decoder import ImageDecoder, loss
 from midway.runs.folder import RunFolder
@@ -99,7 +98,7 @@ def digest(policy: Policy, encoder: Encoder) -> UInt8[np.ndarray, " n"]:
 def fit(policy: Policy, encoder: Encoder) -> ImageDecoder:
     """Return a decoder fitted to the features of an encoder; the run's seed decides all."""
     env_seed, key = seeds.decoder(policy.config.seed)
-    env = environments.make_vec(policy.config.env, num_envs=NUM_ENVS)
+    env = policy.config.declaration().factory(num_envs=NUM_ENVS)
     images = jnp.asarray(sample_images(env, IMAGES, env_seed))
     return fit_to(_apply(encoder, images), images, key, UPDATES)
 
