@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -183,15 +183,11 @@ class Study:
 
     def chain(self) -> Table:
         """Return the positions of the subgoal chain of the hard task."""
-        return self._way(
-            "chain", lambda start, goal: recordings.chain(self.policy, start, goal, CHAIN_DEPTH)
-        )
+        return self._way("chain", partial(recordings.chain, self.policy, depth=CHAIN_DEPTH))
 
     def plan(self) -> Table:
         """Return the positions of the subgoals that are planned for the hard task."""
-        return self._way(
-            "plan", lambda start, goal: recordings.first_plan(self.policy, start, goal)
-        )
+        return self._way("plan", partial(recordings.first_plan, self.policy))
 
     def ends(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
         """Return the positions of start and goal in the middle of the hard task's boxes (m)."""
