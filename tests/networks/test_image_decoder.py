@@ -56,6 +56,6 @@ def test_the_loss_is_the_squared_error_of_an_image() -> None:
 def test_fitting_finds_the_images_of_new_features() -> None:
     """Without the features, the mean image leaves an error that most of must go."""
     features, images = squares(600)
-    decoder = fit_to(features[:500], images[:500], KEY, updates=200)
+    decoder = fit_to(features[:500], images[:500], KEY, updates=400)
     blank = ((images[500:] / 255 - decoder.background) ** 2).sum((1, 2, 3)).mean()
     assert float(error(decoder, features[500:], images[500:])) < 0.4 * float(blank)
