@@ -195,3 +195,37 @@ def in_every_state(policy: Policy, recording: Recording) -> Float[np.ndarray, "T
     if policy.agent.subgoals is None:
         return None
     return draws(imagined(policy, recording), SUBGOALS)
+
+
+def chain(
+    policy: Policy, observation: Float[np.ndarray, " S"], goal: Float[np.ndarray, " G"], depth: int
+) -> Float[np.ndarray, "N G"]:
+    """Return the way from a state to a goal, imagined by halving it ``depth`` times.
+
+    Args:
+        policy: A policy that imagines.
+        observation: The state.
+        goal: The goal.
+        depth: A chain of depth 1 is one subgoal; each further one imagines between the last.
+
+    Returns:
+        ``2 ** depth - 1`` achieved goals, from the state to the goal.
+    """
+    if depth == 0:
+        return np.empty((0, *goal.shape))
+    middle = policy.subgoals(observation[None], goal[None]).location
+    reached, onwards = np.asarray(middle.achieved_goal), np.asarray(middle.observation)
+    before = chain(policy, observation, reached[0], depth - 1)
+    after = chain(policy, onwards[0], goal, depth - 1)
+    return np.concatenate([before, reached, after])
+
+
+def first_plan(
+    policy: Policy, observation: Float[np.ndarray, " S"], goal: Float[np.ndarray, " G"]
+) -> Float[np.ndarray, "N G"]:
+    """Return the subgoals planned between a state and a goal, as an episode begins."""
+    actor = policy.actor()
+    actor(observation[None], goal[None])
+    found = plan(policy, actor.memory)
+    assert found is not None
+    return np.asarray(found[0])
