@@ -13,6 +13,12 @@ import pytest
 
 from midway.training.compilation import give_back_memory, use_compilation_cache
 
+# LLVM's optimisations are most of the time of compiling, and no program of a test is large enough
+# to win it back. The processes that tests start compile alike: their results are compared.
+FLAG = "--xla_backend_optimization_level=0"
+if FLAG not in os.environ.get("XLA_FLAGS", ""):
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAG}".strip()
+
 # No example is timed: a test's time limit (pyproject.toml) is the only clock.
 hypothesis.settings.register_profile(
     "midway", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
@@ -30,10 +36,13 @@ peaks = pytest.StashKey[list[int]]()
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled_programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Compile each program once for the session, and once for the processes that tests start."""
-    folder = tmp_path_factory.mktemp("cache")
+    """Compile each program once for all workers and for the processes that tests start."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
     os.environ["XDG_CACHE_HOME"] = str(folder)
     use_compilation_cache()
+    # Even the smallest: operations outside of compiled functions are compiled one by one.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     return folder
 
 

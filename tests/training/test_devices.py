@@ -21,7 +21,7 @@ from midway.training import state
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What ``on_devices.py`` wrote on four virtual devices."""
     path = tmp_path_factory.mktemp("devices")
-    flags = "--xla_force_host_platform_device_count=4"
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4"
     subprocess.run(
         [sys.executable, Path(__file__).with_name("on_devices.py"), path],
         env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
