@@ -7,7 +7,7 @@ from pathlib import Path
 from midway import presets
 from midway.agent import AnyAgent
 from midway.agents import registry as agents
-from midway.envs import foreign
+from midway.envs import foreign, layouts
 from midway.envs import registry as environments
 from midway.envs.foreign import EnvLike, Foreign, Settings
 from midway.envs.registry import Declaration
@@ -68,6 +68,21 @@ def goal_env(
     return foreign.admit(foreign.describe(env, said, kwargs, tuple(imports)))
 
 
+def maze_env(robot: str, maze: str | Path) -> Declaration:
+    """Return an environment of a robot in a maze of one's own, for `train` and `make_vec`.
+
+    Args:
+        robot: ``point`` or ``ant``.
+        maze: A file of letters (``#`` wall, ``.`` free, ``S`` start and ``G`` goal of the hard
+            task), or of YAML with them as ``map`` and the side of a cell as ``cell`` (m); or
+            ``umaze`` or ``medium``, which are gymnasium-robotics'.
+
+    Raises:
+        ConfigurationError: There is no such robot, or the file holds no map of a maze.
+    """
+    return environments.own_maze(robot, layouts.read(maze))
+
+
 def configure(
     env: EnvLike | Declaration,
     agent: str | AnyAgent = "ris",
@@ -91,15 +106,20 @@ def configure(
     if type(seed) is not int or not 0 <= seed < 2**63:
         raise ConfigurationError(f"seed {seed!r}: must be a whole number from 0 to 2**63 - 1")
     name = agents.name_of(agent)
-    declared = env if isinstance(env, Declaration) else environments.entry(env)
+    declared = environments.entry(env)
     resolved = presets.resolve(declared, name, preset, changes)
     parts = (preset, seed, resolved.train, resolved.hyperparameters)
-    stored = declared.foreign.stored if declared.foreign else None
-    return RunConfig(declared.name, name, *parts, stored)
+    return RunConfig(
+        declared.name,
+        name,
+        *parts,
+        foreign=declared.foreign.stored if declared.foreign else None,
+        maze={"robot": declared.family, **declared.layout.to_json()} if declared.layout else None,
+    )
 
 
 def train(
-    env: EnvLike,
+    env: EnvLike | Declaration,
     *,
     agent: str | AnyAgent = "ris",
     preset: str = "quick",
@@ -114,8 +134,8 @@ def train(
     """Train an agent on an environment and write a run folder.
 
     Args:
-        env: Environment name, what `goal_env` or ``gymnasium.make`` returned, or a class or
-            function that makes it.
+        env: Environment name, what `goal_env`, `maze_env` or ``gymnasium.make`` returned, or a
+            class or function that makes it.
         agent: ``ris``, ``sac`` and so on, ``package.module:NAME``, or the agent itself.
         preset: ``paper``, ``quick``, or the path of a preset file.
         steps: Environment steps; default: the preset's.

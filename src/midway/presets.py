@@ -362,7 +362,7 @@ def resolve(
     Raises:
         ConfigurationError: A name is unknown, or a value is not allowed.
     """
-    declaration = env if isinstance(env, Declaration) else environments.entry(env)
+    declaration = environments.entry(env)
     config = agents.get(agent).Config
     base, rules = _rules(preset)
     train, hyperparameters = TrainConfig(), config()

@@ -18,6 +18,7 @@ from pathlib import Path
 from midway.agents import registry
 from midway.envs import registry as environments
 from midway.envs.foreign import Foreign
+from midway.envs.layouts import Layout
 from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
 from midway.settings import changed
@@ -43,6 +44,7 @@ class RunConfig:
         hyperparameters: The agent's ``Config``.
         foreign: What was decided about an environment that is not midway's, as JSON; None for
             midway's own, and for one that no other process could make.
+        maze: Robot and letters of a maze of one's own, as JSON.
     """
 
     env: str
@@ -52,6 +54,7 @@ class RunConfig:
     train: TrainConfig
     hyperparameters: Hyperparameters
     foreign: JsonObject | None = None
+    maze: JsonObject | None = None
 
     def declaration(self) -> Declaration:
         """Return the declaration of the environment.
@@ -59,6 +62,8 @@ class RunConfig:
         Raises:
             ConfigurationError: It cannot be found.
         """
+        if self.maze is not None:
+            return environments.own_maze(self.maze["robot"], Layout.from_json(self.maze))
         if self.foreign is None:
             return environments.entry(self.env)
         return environments.entry(Foreign.from_json(self.foreign))
@@ -91,6 +96,7 @@ class RunConfig:
                 train=changed(TrainConfig(), values["train"]),
                 hyperparameters=changed(agent.Config(), values["hyperparameters"]),
                 foreign=values.get("foreign"),
+                maze=values.get("maze"),
             )
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigurationError(f"configuration not understood: {error}") from error
