@@ -10,7 +10,7 @@ from midway import presets, settings
 from midway.agents import beyond
 from midway.agents.registry import AGENTS
 from midway.cli.main import main
-from midway.envs.registry import ENVIRONMENTS
+from midway.envs.registry import ENVIRONMENTS, Declaration
 from midway.errors import ConfigurationError
 from midway.presets import RULES, Rule, Source
 from midway.training.config import TrainConfig
@@ -23,11 +23,14 @@ BEFORE = {key: tuple(key.split()) for key in GOLDEN["differences"]}
 """The combinations that commit 47b95e9 knew."""
 
 
+OTHER = Declaration("Reach-v0", "Reach-v0", "other", "not midway's", ("uniform",), "")
+
+
 def applicable(rule: Rule) -> list[tuple[str, str, str]]:
     return [
         (preset, env, agent)
         for preset in presets.NAMES
-        for env, declaration in ENVIRONMENTS.items()
+        for env, declaration in {**ENVIRONMENTS, OTHER.name: OTHER}.items()
         for agent in AGENTS
         if rule.applies(preset, declaration, agent)
     ]
@@ -40,7 +43,7 @@ def plain(config: object) -> dict[str, object]:
 
 
 def identity(rule: Rule) -> str:
-    return f"{rule.preset} {rule.env} {rule.agent}"
+    return f"{rule.preset} {rule.env} {rule.family} {rule.agent}"
 
 
 @pytest.mark.parametrize("rule", RULES, ids=identity)

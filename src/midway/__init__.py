@@ -13,6 +13,7 @@ _PUBLIC = {
     "resume": "midway.api",
     "load": "midway.api",
     "evaluate": "midway.api",
+    "goal_env": "midway.api",
     "make_vec": "midway.envs.registry",
 }
 

@@ -1,13 +1,16 @@
 """The Python interface: train, resume, load, evaluate."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from midway import presets
 from midway.agent import AnyAgent
 from midway.agents import registry as agents
+from midway.envs import foreign
 from midway.envs import registry as environments
+from midway.envs.foreign import EnvLike, Foreign, Settings
+from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
 from midway.runs import complete
 from midway.runs import policy as policies
@@ -35,8 +38,39 @@ class Run:
     finished: bool
 
 
+def goal_env(
+    env: EnvLike,
+    *,
+    success_distance: float | None = None,
+    success_function: str | Callable[..., object] | None = None,
+    max_episode_steps: int | None = None,
+    action_bound: float | None = None,
+    kwargs: Mapping[str, object] | None = None,
+    imports: Sequence[str] = (),
+) -> Foreign:
+    """Return an environment that is not midway's, with what midway must be told of it.
+
+    Args:
+        env: ``Id``, ``module:Id``, ``module:callable``, what ``gymnasium.make`` returned, or a
+            class or function that makes it.
+        success_distance: Distance between the goals below which one counts as reached.
+        success_function: Function of achieved and desired goals that says so, or its
+            ``module:function``.
+        max_episode_steps: Steps of an episode, in place of the registered limit.
+        action_bound: Bounds of actions that have none.
+        kwargs: Keyword arguments of the environment.
+        imports: Modules to import first, which register environments.
+
+    Raises:
+        ConfigurationError: It cannot be made, is no goal environment, has no limit, or does not
+            say when a goal is reached; the text says what to give.
+    """
+    said = Settings(success_distance, success_function, max_episode_steps, action_bound)
+    return foreign.admit(foreign.describe(env, said, kwargs, tuple(imports)))
+
+
 def configure(
-    env: str,
+    env: EnvLike | Declaration,
     agent: str | AnyAgent = "ris",
     preset: str = "quick",
     seed: int = 0,
@@ -45,7 +79,7 @@ def configure(
     """Return a preset with some values changed.
 
     Args:
-        env: Environment name.
+        env: Environment name, another environment, or its declaration.
         agent: Agent name, ``package.module:NAME``, or the agent itself.
         preset: ``paper``, ``quick``, or the path of a preset file.
         seed: The one seed of every generator, from 0.
@@ -58,12 +92,15 @@ def configure(
     if type(seed) is not int or not 0 <= seed < 2**63:
         raise ConfigurationError(f"seed {seed!r}: must be a whole number from 0 to 2**63 - 1")
     name = agents.name_of(agent)
-    resolved = presets.resolve(env, name, preset, changes)
-    return RunConfig(env, name, preset, seed, resolved.train, resolved.hyperparameters)
+    declared = env if isinstance(env, Declaration) else environments.entry(env)
+    resolved = presets.resolve(declared, name, preset, changes)
+    parts = (preset, seed, resolved.train, resolved.hyperparameters)
+    stored = declared.foreign.stored if declared.foreign else None
+    return RunConfig(declared.name, name, *parts, stored)
 
 
 def train(
-    env: str,
+    env: EnvLike,
     *,
     agent: str | AnyAgent = "ris",
     preset: str = "quick",
@@ -78,7 +115,8 @@ def train(
     """Train an agent on an environment and write a run folder.
 
     Args:
-        env: Environment name.
+        env: Environment name, what `goal_env` or ``gymnasium.make`` returned, or a class or
+            function that makes it.
         agent: ``ris``, ``sac`` and so on, ``package.module:NAME``, or the agent itself.
         preset: ``paper``, ``quick``, or the path of a preset file.
         steps: Environment steps; default: the preset's.
@@ -96,7 +134,7 @@ def train(
     named = {"steps": steps, "num_envs": num_envs, "precision": precision}
     given = {name: value for name, value in named.items() if value is not None}
     config = configure(env, agent, preset, seed, {**(changes or {}), **given})
-    folder = RunFolder(Path(out or Path("runs") / run_name(env, config.agent, seed)))
+    folder = RunFolder(Path(out or Path("runs") / run_name(config.env, config.agent, seed)))
     setup = setup_of(config, folder)
     state.check(setup)
     folder.prepare()
@@ -156,7 +194,7 @@ def evaluate(
     path: str | Path,
     *,
     episodes: int = 100,
-    task: str = "hard",
+    task: str | None = None,
     actions: ActionKind = "mean",
     seed: int = 0,
 ) -> Evaluation:
@@ -165,7 +203,8 @@ def evaluate(
     Args:
         path: The run folder.
         episodes: Number of episodes.
-        task: ``hard``, ``uniform`` or a named case of the environment.
+        task: ``hard``, ``uniform`` or a named case of the environment; default: ``hard`` where
+            there is one, else the environment's own starts and goals.
         actions: ``mean`` or ``sampled``.
         seed: Seed of starts and goals.
 
@@ -175,15 +214,18 @@ def evaluate(
     if episodes < 1:
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
     policy = load(path)
-    env = environments.make_vec(policy.config.env, num_envs=episodes, task=task)
+    declared = policy.config.declaration()
+    task = task or declared.shown_task
+    env = declared.factory(num_envs=episodes, task=task)
     return run_episodes(env, policy.actor(actions, seed), task, actions, seeds.evaluation(seed))
 
 
 def setup_of(config: RunConfig, folder: RunFolder) -> state.Setup:
     """Return what the run of this configuration is made of; nothing is written."""
+    declared = config.declaration()
 
     def make_env(num_envs: int, task: str) -> VectorGoalEnv:
-        return environments.make_vec(config.env, num_envs=num_envs, task=task)
+        return declared.factory(num_envs=num_envs, task=task)
 
     agent = agents.get(config.agent)
     parts = (config.hyperparameters, config.train, config.seed, make_env, folder.path)
@@ -246,7 +288,8 @@ def _chosen(folder: RunFolder, config: RunConfig, from_step: int | None) -> int 
     number = Checkpoints(folder.checkpoints, folder.owner(config)).choose(from_step)
     if number is None and complete.had_checkpoint(folder, config):
         raise ConfigurationError(
-            f"run folder {folder.path}: its checkpoints are gone: --from 0 starts anew"
+            f"run folder {folder.path}: its checkpoints are gone; to start anew: "
+            f"midway resume {folder.path} --from 0"
         )
     return number
 
@@ -260,6 +303,8 @@ def _run_locked(
     checkpoints.remove_unfinished()
     say: Reporter = reporter(config.train.steps, number or 0) if progress else Silent()
     logger = None
+    if rule := config.rule_of_success:
+        say.message(rule)
     try:
         training = state.start(setup, say.message if number is None else None)
         if number is not None:

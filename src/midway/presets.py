@@ -36,6 +36,7 @@ class Rule:
         env: Patterns of environment names, separated by spaces; a name without a pattern's
             wildcard is that environment alone.
         agent: Patterns of agent names, separated by spaces.
+        family: Pattern of the environment's family; ``other`` for those that are not midway's.
         deviates: Why values of ``paper`` are not the paper's; nothing where they are.
     """
 
@@ -44,6 +45,7 @@ class Rule:
     source: str
     env: str = "*"
     agent: str = "*"
+    family: str = "*"
     deviates: str = ""
 
     def applies(self, preset: str, env: Declaration, agent: str) -> bool:
@@ -52,6 +54,7 @@ class Rule:
             self.preset in ("*", preset)
             and any(fnmatch.fnmatchcase(env.name, pattern) for pattern in self.env.split())
             and any(fnmatch.fnmatchcase(agent, pattern) for pattern in self.agent.split())
+            and fnmatch.fnmatchcase(env.family, self.family)
         )
 
 
@@ -221,6 +224,29 @@ QUICK: tuple[Rule, ...] = (
     Rule(
         "quick",
         {
+            "steps": 50_000,
+            "n_step": 3,
+            "clip_targets": True,
+            "hindsight_bound": True,
+            "unreached_goals": True,
+            "layer_norm": True,
+            "normalise": True,
+            "goal_inputs": "relative",
+        },
+        "trials of PandaReach and PointMaze: units are not known",
+        family="other",
+        agent="ris sac",
+    ),
+    Rule(
+        "quick",
+        {"candidates_per_pair": 8, "advantage_temperature": 2.0, "subgoal_learning_rate": 1e-3},
+        "trials of PandaReach and PointMaze",
+        family="other",
+        agent="ris",
+    ),
+    Rule(
+        "quick",
+        {
             "num_subgoals": 4,
             "subgoal_every": 4,
             "candidates_per_pair": 8,
@@ -322,11 +348,13 @@ RULES = (*PAPER, *QUICK)
 NAMES = ("paper", "quick")
 
 
-def resolve(env: str, agent: str, preset: str = "quick", changes: Values | None = None) -> Resolved:
+def resolve(
+    env: str | Declaration, agent: str, preset: str = "quick", changes: Values | None = None
+) -> Resolved:
     """Return the settings of a preset for an environment and an agent.
 
     Args:
-        env: Environment name.
+        env: Environment name, or its declaration.
         agent: Agent name.
         preset: ``paper``, ``quick``, or the path of a preset file.
         changes: Values that win over the preset's.
@@ -334,7 +362,8 @@ def resolve(env: str, agent: str, preset: str = "quick", changes: Values | None 
     Raises:
         ConfigurationError: A name is unknown, or a value is not allowed.
     """
-    declaration, config = environments.entry(env), agents.get(agent).Config
+    declaration = env if isinstance(env, Declaration) else environments.entry(env)
+    config = agents.get(agent).Config
     base, rules = _rules(preset)
     train, hyperparameters = TrainConfig(), config()
     sources = {
@@ -392,7 +421,7 @@ def _read(path: Path) -> tuple[str, Sequence[Rule]]:
         raise ConfigurationError(f"preset {path}: {error}") from error
     except (TypeError, AttributeError):
         raise ConfigurationError(
-            f"preset {path}: a [[rule]] has values, and may have env, agent and source"
+            f"preset {path}: a [[rule]] has values, and may have env, agent, family and source"
         ) from None
     if base not in NAMES or content:
         unknown = ", ".join(content) or f"base {base!r}"

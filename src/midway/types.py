@@ -1,7 +1,7 @@
 """Containers and contracts that every floor shares."""
 
 from collections.abc import Mapping
-from dataclasses import Field, asdict, dataclass, replace
+from dataclasses import Field, asdict, dataclass, fields, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -140,6 +140,9 @@ class EnvSpec:
         spread: Typical deviation of each entry from it.
         image_shape: Shape of the images that a frozen encoder made these observations of; ``None``
             where they are the environment's own.
+        goal_coordinates: Entries of the observation that are the achieved goal, where goals are not
+            observations; nothing where that is not known.
+        can_fail: Whether the environment may end an episode before its goal is reached.
     """
 
     name: str
@@ -156,6 +159,8 @@ class EnvSpec:
     center: tuple[float, ...] = ()
     spread: tuple[float, ...] = ()
     image_shape: tuple[int, ...] | None = None
+    goal_coordinates: tuple[int, ...] = ()
+    can_fail: bool = False
 
     @property
     def is_image(self) -> bool:
@@ -176,7 +181,8 @@ class EnvSpec:
     def to_json(self) -> JsonObject:
         """Return plain values; of the task only what `DistanceTask` holds."""
         values = asdict(self)
-        values["task"] = asdict(self.task) if isinstance(self.task, DistanceTask) else None
+        rule = {field.name: getattr(self.task, field.name, None) for field in fields(DistanceTask)}
+        values["task"] = rule if isinstance(self.task, DistanceTask) else None
         return values
 
     @staticmethod
@@ -229,6 +235,10 @@ class VectorGoalEnv(Protocol):
         """Move every copy by one step."""
         ...
 
+    def rest(self, mask: Bool[NumPyArray, " num_envs"]) -> Observations:
+        """Ask no more of these copies, whose episodes are over, until they are reset."""
+        ...
+
     def state_dict(self) -> dict[str, NumPyArray]:
         """Return all that the future depends on."""
         ...
@@ -260,7 +270,8 @@ class Batch(NamedTuple):
     ``outcome`` is what they were computed from; ``None`` where that is ``next_observation`` and
     ``goal``. The others are there where `Sampling` asks for them: ``steps`` from the observation to
     the next one, steps that the episode needed from the observation to the goal (infinite where
-    it is not known to get there), and an observation between the two.
+    it is not known to get there), and an observation between the two. ``failed``: whether the
+    environment ended the episode there without success; only where it may.
     """
 
     observation: Shaped[Array, "B ..."]
@@ -274,6 +285,7 @@ class Batch(NamedTuple):
     steps: Float[Array, " B"] | None = None
     reached_in: Float[Array, " B"] | None = None
     between: Shaped[Array, "B ..."] | None = None
+    failed: Bool[Array, " B"] | None = None
 
 
 @dataclass(frozen=True)

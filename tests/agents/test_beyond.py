@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from midway.agents import beyond, ris, sac
-from midway.networks import inputs, optimizer
+from midway.networks import encoder, inputs, optimizer
+from midway.networks.encoder import StateEncoder
 from midway.networks.mlp import normalised
 from midway.types import Batch, DistanceTask, EnvSpec, Subgoal
 
 TASK = DistanceTask(((0, 1),), 0.5)
+METRES = StateEncoder((), 1.0)
 SPEC = EnvSpec("states", (4,), "float32", (4,), 2, 50, True, None, TASK)
 KEY = jax.random.key(0)
 
@@ -79,8 +81,21 @@ def test_targets_are_clipped():
     np.testing.assert_allclose(target, [0, -2])
 
 
+def test_a_failed_step_is_worth_as_much_as_never_to_arrive():
+    failed = jnp.array([True, True, False])
+    drawn = batch(3, steps=jnp.array([1.0, 3.0, 3.0]), terminated=failed, failed=failed)
+    value = jnp.full(3, -1.0)
+    target = beyond.n_step_target(drawn, value, sac.Config(discount=0.5))
+    np.testing.assert_allclose(target, [-2, -2, -1.875])
+    half = beyond.n_step_target(drawn, value, sac.Config(discount=0.5, failure_cost=0.5))
+    # two steps before the one that fails: -1 - 0.5 - 0.25
+    np.testing.assert_allclose(half, [-1, -1.75, -1.875])
+    dear = beyond.n_step_target(drawn._replace(steps=None), value, sac.Config(failure_cost=2.0))
+    np.testing.assert_allclose(dear[:2], [-200, -200], rtol=1e-5)
+
+
 def test_relative_inputs_by_hand():
-    read = inputs.create(SPEC, "relative", 1.0)
+    read = inputs.create(SPEC, "relative", METRES)
     state, goal = jnp.array([[1.0, 1.0, 7.0, 7.0]]), jnp.array([[4.0, 5.0, 9.0, 9.0]])
     seen, told = read(state, goal)
     np.testing.assert_array_equal(seen, state)
@@ -90,22 +105,43 @@ def test_relative_inputs_by_hand():
 
 
 def test_inputs_of_one_state_and_many_goals_are_broadcast():
-    read = inputs.create(SPEC, "relative", 1.0)
+    read = inputs.create(SPEC, "relative", METRES)
     _, told = read(jnp.zeros((3, 1, 4)), jnp.ones((3, 5, 4)))
     assert told.shape == (3, 5, 7)
 
 
 def test_a_subgoal_of_coordinates_is_a_state_at_that_place():
-    read = inputs.create(SPEC, "coordinates", 1.0)
+    read = inputs.create(SPEC, "coordinates", METRES)
     state = jnp.array([[1.0, 2.0, 3.0, 4.0]])
     found = read.embed(state, jnp.array([[8.0, 9.0]]))
     np.testing.assert_array_equal(found, [[8, 9, 3, 4]])
     np.testing.assert_array_equal(read.pick(found), [[8, 9]])
 
 
+def test_goals_that_are_entries_of_the_observation():
+    task = DistanceTask(((0, 1),), 0.5)
+    spec = EnvSpec("x", (4,), "float32", (2,), 2, 9, False, None, task, goal_coordinates=(3, 1))
+    scaled = StateEncoder((0.0, 1.0, 0.0, 2.0), (1.0, 2.0, 1.0, 2.0), goal_coordinates=(3, 1))
+    state, goal = jnp.array([[7.0, 3.0, 7.0, 4.0]]), jnp.array([[6.0, 9.0]])
+    np.testing.assert_allclose(scaled(goal), [[2, 4]])
+    np.testing.assert_allclose(scaled.states(scaled(goal)), goal)
+    read = inputs.create(spec, "relative", scaled)
+    seen, told = read(scaled(state), scaled(goal))
+    np.testing.assert_array_equal(seen, [[7, 1, 7, 1]])
+    # near: 0.5 in units of 2; the state is at (1, 1) of these coordinates, the goal at (2, 4)
+    away = np.sqrt(10)
+    np.testing.assert_allclose(
+        told[0], [2, 4, 1, 3, 1 / (away + 0.25), 3 / (away + 0.25), np.log(away + 0.125)], rtol=1e-5
+    )
+    subgoal = encoder.as_subgoal(spec, read.embed(seen, jnp.array([[8.0, 9.0]])))
+    np.testing.assert_array_equal(subgoal.observation, [[7, 9, 7, 8]])
+    np.testing.assert_array_equal(subgoal.achieved_goal, [[8, 9]])
+    assert encoder.subgoal_size(spec) == 4
+
+
 def test_goals_that_are_no_observations_are_read_whole():
     pairs = replace(SPEC, observation_shape=(6,), goal_shape=(2,), goal_is_observation=False)
-    assert inputs.create(pairs, "relative", 1.0).size(2) == 2
+    assert inputs.create(pairs, "relative", METRES).size(2) == 2
 
 
 def test_normalised_layers_have_mean_0_and_variance_1():

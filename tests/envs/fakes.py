@@ -128,7 +128,11 @@ class Seen(gymnasium.ObservationWrapper[Any, Any, Any]):
             "image": spaces.Box(0, 255, shape, np.uint8),
             "same": old["achieved_goal"],
         }[form]
-        self.observation_space = spaces.Dict({**old.spaces, "observation": new})
+        shown = {**old.spaces, "observation": new}
+        if form == "image":
+            states = {"achieved_state": old["achieved_goal"], "desired_state": old["desired_goal"]}
+            shown |= {"achieved_goal": new, "desired_goal": new} | states
+        self.observation_space = spaces.Dict(shown)
 
     def observation(self, observation: Any) -> Any:
         place = observation["achieved_goal"]
@@ -137,7 +141,23 @@ class Seen(gymnasium.ObservationWrapper[Any, Any, Any]):
             "image": np.full(self.shape, 100, np.uint8),
             "same": place,
         }[self.form]
+        if self.form == "image":
+            goals = {"achieved_goal": new, "desired_goal": new}
+            states = {"achieved_state": place, "desired_state": observation["desired_goal"]}
+            return {"observation": new} | goals | states
         return {**observation, "observation": new}
+
+
+class Hidden(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """The plane where only the speed is observed, and the place as the achieved goal."""
+
+    def __init__(self) -> None:
+        super().__init__(gymnasium.wrappers.TimeLimit(Plane(), 20))
+        old: Any = self.env.observation_space
+        self.observation_space = spaces.Dict({**old.spaces, "observation": old["achieved_goal"]})
+
+    def observation(self, observation: Any) -> Any:
+        return {**observation, "observation": observation["observation"][2:]}
 
 
 def limited(**options: Any) -> gymnasium.Env[Any, Any]:

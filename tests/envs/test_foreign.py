@@ -22,6 +22,7 @@ import midway
 from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, admit, describe, with_limit
 from midway.envs.sources import source
 from midway.errors import ConfigurationError, NonFiniteError
+from midway.training import seeds as midway_seeds
 
 TINY = {
     "hidden": (8,),
@@ -189,12 +190,27 @@ def test_observations_of_every_form(form: str, shape: Any, read: Any, dtype: str
     foreign = describe(fakes.Seen, None, {"form": form, "shape": shape})
     assert foreign.spec.observation_shape == read
     assert foreign.spec.observation_dtype == dtype
-    assert foreign.spec.goal_is_observation == (form == "same")
+    assert foreign.spec.goal_is_observation == (form != "dict")
     env = ForeignVectorEnv(foreign, 2)
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
     if form == "image":
         assert (observation["observation"] == 100).all()
+
+
+def test_images_with_goals_of_numbers_are_refused() -> None:
+    class Mixed(gymnasium.ObservationWrapper[Any, Any, Any]):
+        def __init__(self) -> None:
+            super().__init__(fakes.limited())
+            image = spaces.Box(0, 255, (84, 84, 3), np.uint8)
+            old: Any = self.env.observation_space
+            self.observation_space = spaces.Dict({**old.spaces, "observation": image})
+
+        def observation(self, observation: Any) -> Any:
+            return {**observation, "observation": np.zeros((84, 84, 3), np.uint8)}
+
+    with pytest.raises(ConfigurationError, match="observes images but its goals are numbers"):
+        describe(Mixed)
 
 
 def test_an_image_is_shrunk_by_means_over_its_pixels() -> None:
@@ -365,15 +381,54 @@ def test_a_process_that_is_gone_is_told() -> None:
 
 @pytest.mark.parametrize("agent", ["ris", "sac"])
 def test_train_resume_and_evaluate(tmp_path: Path, agent: str) -> None:
-    """RIS predicts pairs of observation and achieved goal here, of sizes 4 and 2."""
     name = "tests/Reach-v0"
     made = midway.train(name, agent=agent, steps=60, out=tmp_path / "run", changes=TINY)
     assert made.finished
     assert midway.resume(made.path, steps=120).finished
-    result = midway.evaluate(made.path, episodes=3, task="uniform")
+    result = midway.evaluate(made.path, episodes=3)
+    assert result.task == "uniform"
     assert len(result.episodes) == 3
     action = midway.load(made.path)(np.zeros(4, np.float32), np.zeros(2, np.float32))
     assert action.shape == (2,)
+
+
+def test_success_is_what_the_environment_says_in_a_loop_of_its_own(tmp_path: Path) -> None:
+    """The reward is 1 at the goal, 0 elsewhere, and the episode goes on there."""
+    env = midway.goal_env(fakes.limited, kwargs={"reward": "plus"})
+    run = midway.train(env, agent="sac", steps=60, out=tmp_path / "run", changes=TINY)
+    policy, found = midway.load(run.path), midway.evaluate(run.path, episodes=12, seed=3).episodes
+    vector, single = midway.make_vec(env, num_envs=12), fakes.limited(reward="plus")
+    starts, _ = vector.reset(seed=midway_seeds.evaluation(3))
+    assert 0 < sum(episode.success for episode in found) < 12
+    for number, episode in enumerate(found):
+        single.reset(seed=0)
+        plane = single.unwrapped
+        plane.place = starts["achieved_goal"][number].astype(np.float64)
+        plane.goal = starts["desired_goal"][number].astype(np.float64)
+        said, seen = False, np.concatenate([plane.place, np.zeros(2)])
+        length = 0
+        while length < 20 and not said:
+            length += 1
+            action = policy(seen.astype(np.float32), starts["desired_goal"][number])
+            shown, *_ = single.step(action)
+            seen = shown["observation"]
+            said = plane.compute_reward(shown["achieved_goal"], shown["desired_goal"], {}) == 1
+        assert (said, length) == (episode.success, episode.length)
+
+
+def test_a_state_tells_its_goal_and_how_far_states_vary() -> None:
+    whole = plane().spec
+    assert whole.observation_shape == (4,)
+    assert whole.goal_coordinates == (0, 1)
+    assert whole.spread[0] == whole.spread[1] > 0.1
+    seen = describe(fakes.Seen, None, {"form": "dict"})
+    # "at" and one of three categories, of which two never show; "at" is the goal
+    assert (seen.spec.goal_coordinates, seen.spec.spread[3:]) == ((0, 1), (1.0, 1.0))
+    hidden = describe(fakes.Hidden)
+    assert hidden.spec.observation_shape == (4,)
+    assert hidden.spec.goal_coordinates == (2, 3)
+    observation, _ = ForeignVectorEnv(hidden, 3).reset(seed=0)
+    np.testing.assert_array_equal(observation["observation"][:, 2:], observation["achieved_goal"])
 
 
 def test_what_is_no_environment_is_refused_by_name() -> None:

@@ -48,12 +48,13 @@ BATCH = 2048
 QUICKLY = {"xla_backend_optimization_level": 0}
 begin = jax.jit(buffer.begin, compiler_options=QUICKLY)
 add = jax.jit(buffer.add, compiler_options=QUICKLY)
-_sample = jax.jit(buffer.sample, static_argnums=(1, 2, 3), compiler_options=QUICKLY)
+_sample = jax.jit(buffer.sample, static_argnums=(1, 2, 3, 5), compiler_options=QUICKLY)
 
 
-def sample(replay, spec, mix, seed):
+def sample(replay, spec, mix, seed, wanted=None):
     """A batch as NumPy arrays."""
-    return jax.tree.map(np.asarray, _sample(replay, spec, mix, BATCH, jax.random.key(seed)))
+    key = jax.random.key(seed)
+    return jax.tree.map(np.asarray, _sample(replay, spec, mix, BATCH, key, wanted))
 
 
 SPECS = {spec.name: spec for spec in (VECTOR, PAIR, IMAGE)}

@@ -22,7 +22,7 @@ from midway.errors import ConfigurationError
 from midway.replay import buffer
 from midway.replay.buffer import create, memory_bytes, num_transitions
 from midway.replay.relabel import source_counts
-from midway.types import DistanceTask, EnvSpec, RelabelMix
+from midway.types import DistanceTask, EnvSpec, RelabelMix, Sampling
 
 TASK = DistanceTask(groups=((0, 1),), threshold=0.5)
 ANT = EnvSpec("ant-u", (31,), "float32", (31,), 8, 600, True, None, TASK)
@@ -63,6 +63,34 @@ def test_batch_of_one_source(shares):
     assert batch.goal.shape == (BATCH, 3)
     assert np.all((batch.goal[:, 2] == 1000) == (shares[0] == 1))
     assert int(num_transitions(replay)) == len(reference.transitions()) == 9
+
+
+def test_a_failure_ends_the_value_of_its_last_step_alone():
+    """Also where n-step returns reach it, and in the episode that overwrites its rows."""
+    task = DistanceTask(groups=((0,),), threshold=0.5)
+    spec = EnvSpec("x", (1,), "float32", (1,), 1, 3, True, None, task, can_fail=True)
+    everyone = np.ones(1, bool)
+    replay = create(spec, 10, 1)
+    for fails in (True, False, False):
+        shown = {"observation": np.zeros((1, 1)), "desired_goal": np.full((1, 1), 9.0)}
+        replay = begin(replay, shown, everyone)
+        for step in (1, 2, 3):
+            here = {
+                "observation": np.full((1, 1), float(step)),
+                "failed": everyone & fails & (step == 3),
+            }
+            replay = add(replay, np.zeros((1, 1)), here, everyone)
+        batch = sample(replay, spec, RelabelMix(1.0, 0.0, 0.0), seed=0)
+        if fails:
+            last = np.asarray(batch.next_observation[:, 0]) == 3
+            np.testing.assert_array_equal(batch.failed, last)
+            np.testing.assert_array_equal(batch.terminated, last)
+            far = sample(replay, spec, RelabelMix(1.0, 0.0, 0.0), seed=0, wanted=Sampling(n_step=3))
+            np.testing.assert_array_equal(far.failed, np.ones(BATCH, bool))
+            reached = sample(replay, spec, RelabelMix(0.0, 0.0, 1.0), seed=0)
+            there = np.asarray(reached.goal == reached.next_observation)[:, 0]
+            assert not (np.asarray(reached.failed) & there).any()
+    assert not np.asarray(batch.failed).any()
 
 
 @pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)

@@ -161,7 +161,11 @@ class Line:
         self.left -= 1
         self.elapsed += 1
         info = {"elapsed_steps": self.elapsed.copy(), "distance": self.left.copy()}
+        info["is_success"] = self.left <= 0
         return self.observe(), None, self.left <= 0, self.elapsed >= 3, info
+
+    def rest(self, mask: Any) -> Any:
+        return self.reset(options={"reset_mask": mask})[0]
 
 
 def test_evaluation_records_the_first_episode_of_every_environment() -> None:

@@ -40,7 +40,11 @@ class Lengths:
     def step(self, actions: Any) -> Any:
         self.elapsed += 1
         over = self.elapsed >= self.lengths
-        return self.observe(), None, over & (self.lengths < 3), over, {}
+        info = {"is_success": over & (self.lengths < 3)}
+        return self.observe(), None, info["is_success"], over, info
+
+    def rest(self, mask: Any) -> Any:
+        return self.reset(options={"reset_mask": mask})[0]
 
 
 class Still:

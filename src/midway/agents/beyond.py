@@ -38,6 +38,7 @@ class Settings:
     normalise: bool = setting(False, "none", "states by the environment's center and spread")
     goal_inputs: GoalInputs = setting("whole", "none", "of the networks", choices=GOAL_INPUTS)
     policy_every: int = setting(1, "table 1", "updates for each of the policy", least=1)
+    failure_cost: float = setting(1.0, "ours", "of a failed episode, times 1 / (1 - γ)", least=0)
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,10 @@ class Discounted(Protocol):
         """Whether the way that the episode took to the goal bounds its value from below."""
 
     @property
+    def failure_cost(self) -> float:
+        """Cost of an episode that fails, times 1 / (1 - γ)."""
+
+    @property
     def unreached_goals(self) -> bool:
         """Whether goals that are reached already are drawn again."""
 
@@ -117,7 +122,7 @@ def actor_critic(
 ) -> tuple[Encoder, TwinCritic, GaussianPolicy]:
     """Return encoder, critics and policy at their random start, from a key for each."""
     encoder = encoders.create(spec, config, keys[0])
-    read = inputs.create(spec, config.goal_inputs, encoders.scale(encoder))
+    read = inputs.create(spec, config.goal_inputs, encoder)
     pair, layers = pair_size(spec, read), (config.hidden, config.precision)
     critic = TwinCritic(
         pair + spec.action_dim,
@@ -152,7 +157,8 @@ def n_step_target(
     """Return the target of Q after n steps: -(1 - γ^n) / (1 - γ) + γ^n (1 - terminated) V(s_n, g).
 
     For n = 1 this is `functional.td_target` with reward -1. Then the two bounds, where asked for:
-    never below what the episode itself needed to the goal, never outside [-1 / (1 - γ), 0].
+    never below what the episode itself needed to the goal, never outside [-1 / (1 - γ), 0]. A step
+    that fails is worth ``failure_cost`` times -1 / (1 - γ): as much as never to get there.
     """
     discount = config.discount
     kept = discount if batch.steps is None else discount**batch.steps
@@ -161,6 +167,11 @@ def n_step_target(
     target = functional.td_target(reward, terminated, next_value, kept)
     if config.hindsight_bound and batch.reached_in is not None:
         target = jnp.maximum(target, discounted(batch.reached_in, discount))
+    if batch.failed is not None:
+        lost = -config.failure_cost * functional.value_bound(discount)
+        before = jnp.zeros_like(target) if batch.steps is None else batch.steps - 1
+        failure = discounted(before, discount) + discount**before * lost
+        target = jnp.where(batch.failed, failure, target)
     if config.clip_targets:
         target = jnp.clip(target, -functional.value_bound(discount), 0.0)
     return target

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from midway.cli.about import NOTHING, AboutEnv
 from midway.cli.parsing import Count, OptionalCount, parse, plain, settings
 from midway.errors import ConfigurationError, NonFiniteError
 
@@ -29,11 +30,12 @@ def train(
     out: Path | None = None,
     precision: Literal["f32", "bf16"] | None = None,
     set: tuple[str, ...] = (),
+    about: AboutEnv = NOTHING,
 ) -> None:
     """Train an agent on an environment and write a run folder.
 
     Args:
-        env: Environment name (see `midway envs`).
+        env: Environment name (see `midway envs`), a Gymnasium id, module:Id or module:callable.
         agent: ris, sac, tdm or leap, or PACKAGE.MODULE:NAME for an agent of your own.
         preset: paper (table 1), quick (two cores), or a file ending in .toml.
         steps: Environment steps; default: the preset's.
@@ -42,11 +44,12 @@ def train(
         out: Run folder; default: runs/ENV-AGENT-seedN.
         precision: Matrix products in float32 or bfloat16; default: the preset's.
         set: Other settings of the preset, as NAME=VALUE.
+        about: What midway must be told of an environment that is not its own.
     """
     from midway import api
 
     run = api.train(
-        env,
+        about.env(env),
         agent=agent,
         preset=preset,
         steps=steps,
@@ -58,6 +61,29 @@ def train(
         progress=True,
     )
     _say_where(run)
+
+
+def check(
+    env: Positional[str],
+    num_envs: Count = 16,
+    seconds: float = 15.0,
+    about: AboutEnv = NOTHING,
+) -> None:
+    """Say what midway sees of a goal environment, and what is wrong with it.
+
+    Args:
+        env: Environment name, a Gymnasium id, module:Id or module:callable.
+        num_envs: Environments that are stepped together to measure.
+        seconds: How long random actions are taken, at most.
+        about: What midway must be told of an environment that is not its own.
+    """
+    from midway.envs import examine
+
+    findings = examine.examine(env, about.settings(), num_envs, seconds, **about.source())
+    for label, text, _ in findings:
+        print(f"{label:15} {text}")
+    if not all(ok for _, _, ok in findings):
+        sys.exit(EXIT_USAGE)
 
 
 def resume(
@@ -82,7 +108,7 @@ def resume(
 def evaluate(
     run: Positional[Path],
     episodes: Count = 100,
-    task: str = "hard",
+    task: str | None = None,
     actions: Literal["mean", "sampled"] = "mean",
     seed: int = 0,
     json: bool = False,
@@ -92,7 +118,7 @@ def evaluate(
     Args:
         run: Run folder.
         episodes: Number of episodes.
-        task: hard, uniform, or a numbered case of the environment.
+        task: hard, uniform, or a numbered case of the environment; default: hard, if there is one.
         actions: Mean or sampled actions.
         seed: Seed of starts and goals.
         json: Print one JSON object, with every episode.
@@ -105,7 +131,7 @@ def evaluate(
         _print_json(
             {
                 "run": str(run),
-                "task": task,
+                "task": result.task,
                 "actions": actions,
                 "seed": seed,
                 "success_rate": result.success_rate,
@@ -116,7 +142,7 @@ def evaluate(
         return
     named = ", ".join(f"{name} {d:.3f} m" for name, d in result.final_distances.items())
     print(
-        f"{run}: {task}, {actions} actions: success {result.success_rate:.1%} of {episodes} "
+        f"{run}: {result.task}, {actions} actions: success {result.success_rate:.1%} of {episodes} "
         f"episodes, {result.length:.1f} steps, {result.final_distance:.2f} m from the goal"
         + (f" ({named})" if named else "")
     )
@@ -131,6 +157,7 @@ def sweep(
     out: Path = Path("runs/sweep"),
     ray: str | None = None,
     set: tuple[str, ...] = (),
+    about: AboutEnv = NOTHING,
 ) -> None:
     """Train every combination of environments, agents and seeds; typed again, it goes on.
 
@@ -144,6 +171,7 @@ def sweep(
         ray: Address of a Ray cluster (auto: the one of this machine); default: this machine's
             cores, one run on each.
         set: Other settings of the preset, as NAME=VALUE.
+        about: What midway must be told of environments that are not its own.
     """
     from rich.console import Console
     from rich.live import Live
@@ -158,8 +186,8 @@ def sweep(
     for env in envs:
         for agent in agents:
             for seed in seeds:
-                api.configure(env, agent, preset, seed, changes)
-    options = ["--preset", preset]
+                api.configure(about.env(env), agent, preset, seed, changes)
+    options = ["--preset", preset, *about.options()]
     options += ["--set", *[f"{k}={v}" for k, v in changes.items()]] if changes else []
     wanted = sweeps.jobs(envs, agents, seeds, options)
     for job in wanted:
@@ -188,7 +216,7 @@ def report(runs: Positional[tuple[Path, ...]], out: Path | None = None) -> None:
 def watch(
     run: Positional[Path],
     out: Path | None = None,
-    task: str = "hard",
+    task: str | None = None,
     episodes: Count = 1,
     seed: int = 0,
     live: bool = False,
@@ -198,7 +226,7 @@ def watch(
     Args:
         run: Run folder.
         out: The file, .mp4 or .gif; default: videos/TASK.mp4 in the run folder.
-        task: hard, uniform, or a numbered case of the environment.
+        task: hard, uniform, or a numbered case of the environment; default: hard, if there is one.
         episodes: Number of episodes.
         seed: Seed of starts and goals.
         live: Show the episodes in a window instead; needs a display.
@@ -329,6 +357,7 @@ def presets(
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
+    "check": check,
     "train": train,
     "resume": resume,
     "sweep": sweep,

@@ -11,6 +11,7 @@ from midway.envs.deciding import REMEDY
 from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, describe
 from midway.envs.success import judge
 from midway.errors import ConfigurationError
+from midway.types import EnvSpec
 
 Finding: TypeAlias = tuple[str, str, bool]
 """What was looked at, what was found, and whether it is well."""
@@ -93,8 +94,14 @@ def _observation(foreign: Foreign, spaces: Any) -> str:
 
 def _goal(foreign: Foreign, spaces: Any) -> str:
     spec = foreign.spec
-    same = "the observation itself" if spec.goal_is_observation else "part of what is observed"
-    return f"{spec.goal_shape}, read from {_space(spaces['desired_goal'])}: {same}"
+    return f"{spec.goal_shape}, read from {_space(spaces['desired_goal'])}: {_role(spec)}"
+
+
+def _role(spec: EnvSpec) -> str:
+    """Return what the achieved goal is in the observation."""
+    if spec.goal_is_observation:
+        return "the observation itself"
+    return f"entries {list(spec.goal_coordinates)} of the observation"
 
 
 def _space(space: Any) -> str:

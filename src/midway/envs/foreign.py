@@ -9,7 +9,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -23,10 +23,10 @@ from midway.envs.reading import readings
 from midway.envs.simulation import num_cores
 from midway.envs.sources import Source, source
 from midway.envs.success import Rule, judge, reference_of
-from midway.envs.vector import Array, GoalVectorEnv, Observations, Step
+from midway.envs.vector import Array, GoalVectorEnv
 from midway.envs.workers import Workers
 from midway.errors import ConfigurationError, NonFiniteError
-from midway.types import EnvSpec
+from midway.types import DistanceTask, EnvSpec, Observations, Step, UnknownTask
 
 CHEAP_SECONDS = 0.002
 """Environments whose steps take less time together are stepped without other processes."""
@@ -84,6 +84,14 @@ class Foreign:
         """What counts as success, as one line for the user."""
         return f"{self.spec.name}: a goal is reached {self.rule.description}"
 
+    @property
+    def stored(self) -> dict[str, Any] | None:
+        """What a run folder stores; None where only this process can make the environment."""
+        try:
+            return self.to_json()
+        except ConfigurationError:
+            return None
+
     def to_json(self) -> dict[str, Any]:
         """Return what a run folder stores.
 
@@ -95,8 +103,8 @@ class Foreign:
         function = self.settings.success_function
         if function is not None and not isinstance(function, str):
             settings["success_function"] = reference_of(function)[0]
-        spec = {k: v for k, v in vars(self.spec).items() if k not in ("task", "origin", "unit")}
-        return stored | {"settings": settings, "spec": spec}
+        spec = replace(self.spec, task=UnknownTask()).to_json()
+        return stored | {"settings": settings, "spec": spec, "seconds": self.seconds}
 
     @staticmethod
     def from_json(stored: Mapping[str, Any]) -> "Foreign":
@@ -106,16 +114,13 @@ class Foreign:
             ConfigurationError: It is none.
         """
         try:
-            shapes = ("observation_shape", "goal_shape", "state_shape")
-            spec: dict[str, Any] = {
-                name: tuple(value) if name in shapes and value is not None else value
-                for name, value in stored["spec"].items()
-            }
-            task = success.from_json(stored["success"])
             return Foreign(
                 source=Source.from_json(stored["source"]),
-                spec=EnvSpec(**spec, task=task),
+                spec=replace(
+                    EnvSpec.from_json(stored["spec"]), task=success.from_json(stored["success"])
+                ),
                 settings=Settings(**stored["settings"]),
+                seconds=float(stored["seconds"]),
             )
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigurationError(f"stored environment cannot be read: {error}") from error
@@ -167,9 +172,10 @@ def describe(
         rule = deciding.given(evidence, *given) or deciding.own(evidence)
     finally:
         other.close()
+    shape, center, spread, coordinates = _scales(name, seen, rule)
     spec = EnvSpec(
         name=name,
-        observation_shape=read["observation"].shape,
+        observation_shape=shape,
         observation_dtype=read["observation"].dtype,
         goal_shape=read["desired_goal"].shape,
         action_dim=int(np.prod(actions.shape)),
@@ -177,8 +183,17 @@ def describe(
         goal_is_observation=seen.goal_is_observation,
         state_shape=read["desired_state"].shape if kind == "state" else None,
         task=rule,
+        center=center,
+        spread=spread,
+        goal_coordinates=coordinates,
+        can_fail=True,
     )
     return Foreign(origin, spec, settings, seen.seconds)
+
+
+EnvLike: TypeAlias = str | Foreign | gymnasium.Env[Any, Any] | Callable[..., Any]
+"""What stands for an environment: a name, what `describe` returned, what ``gymnasium.make``
+returned, or what makes it, such as its class."""
 
 
 _ADMITTED: dict[str, Foreign] = {}
@@ -190,13 +205,14 @@ def admit(foreign: Foreign) -> Foreign:
     return foreign
 
 
-def described(name: str) -> Foreign:
+def described(env: EnvLike) -> Foreign:
     """Return the environment that was admitted by this name, else describe and admit it.
 
     Raises:
         ConfigurationError: As `describe`.
     """
-    return _ADMITTED.get(name) or admit(describe(name))
+    known = _ADMITTED.get(env) if isinstance(env, str) else None
+    return known or admit(describe(env))
 
 
 class ForeignVectorEnv(GoalVectorEnv):
@@ -231,13 +247,20 @@ class ForeignVectorEnv(GoalVectorEnv):
         made = judge(foreign.source)
         read = readings(foreign.spec.name, made.observation_space)
         state = read.get("desired_state")
-        boxes = [_as_float32(read[name].box()) for name in ("observation", "desired_goal")]
+        shown, goal = (_as_float32(read[name].box()) for name in ("observation", "desired_goal"))
+        self._adds_goal = shown.shape != foreign.spec.observation_shape
+        if self._adds_goal:
+            low, high = (
+                np.concatenate(ends) for ends in ((shown.low, goal.low), (shown.high, goal.high))
+            )
+            shown = spaces.Box(low, high, dtype=np.float32)
         super().__init__(
             foreign.spec,
             num_envs,
             ("uniform",),
             task,
-            *boxes,
+            shown,
+            goal,
             state_box=None if state is None else _as_float32(state.box()),
         )
         self.render_mode = render_mode
@@ -258,13 +281,14 @@ class ForeignVectorEnv(GoalVectorEnv):
         self._contradictions = 0
         self._resting = np.zeros(num_envs, np.bool_)
 
-    def rest(self, mask: Bool[Array, " num_envs"]) -> None:
+    def rest(self, mask: Bool[Array, " num_envs"]) -> Observations:
         """Step these no more until they are reset: simulators of others can be slow.
 
         They show what they last showed, and their episodes have no further ends.
         """
         self._resting |= mask
         self._ended &= ~mask
+        return self._newest
 
     def step(self, actions: Array) -> Step:
         """Move every environment by one step, as `GoalVectorEnv.step`.
@@ -338,6 +362,9 @@ class ForeignVectorEnv(GoalVectorEnv):
     def _observe(self) -> Observations:
         boxes: Any = self.single_observation_space
         self._newest = {name: self._held[name].astype(box.dtype) for name, box in boxes.items()}
+        if self._adds_goal:
+            parts = self._newest["observation"], self._newest["achieved_goal"]
+            self._newest["observation"] = np.concatenate(parts, axis=1)
         return self._newest
 
     def _info(
@@ -380,6 +407,49 @@ def with_limit(foreign: Foreign, max_episode_steps: int) -> Foreign:
     settings = replace(foreign.settings, max_episode_steps=max_episode_steps)
     spec = replace(foreign.spec, max_episode_steps=max_episode_steps)
     return replace(foreign, spec=spec, settings=settings)
+
+
+def _scales(
+    name: str, probes: Probes, rule: Rule
+) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...], tuple[int, ...]]:
+    """Return shape, middle and spread of an observation, and its entries that are the goal.
+
+    Where the observation lacks the achieved goal, it is appended, so that a state tells its goal.
+    Goals that were wished for count for the middle and the spread of these entries, and those of
+    one distance have one spread.
+
+    Raises:
+        ConfigurationError: Observations are images, and goals are not.
+    """
+    seen, achieved = probes.observation, probes.achieved.astype(np.float32)
+    if seen.ndim > 2:
+        if not probes.goal_is_observation:
+            raise ConfigurationError(
+                f"{name}: it observes images but its goals are numbers: observe numbers, or give "
+                "goals as images with achieved_state and desired_state beside them"
+            )
+        return seen.shape[1:], (), (), ()
+    places = () if probes.goal_is_observation else _places(seen, achieved)
+    if not probes.goal_is_observation and not places:
+        places = tuple(range(seen.shape[1], seen.shape[1] + achieved.shape[1]))
+        seen = np.concatenate([seen, achieved], axis=1)
+    center, spread = seen.mean(0), seen.std(0)
+    coordinates = np.array(places or range(seen.shape[1]))
+    if achieved.shape[1] == len(coordinates):
+        goals = np.concatenate([achieved, probes.desired])
+        center[coordinates], spread[coordinates] = goals.mean(0), goals.std(0)
+        for group in rule.groups if isinstance(rule, DistanceTask) else ():
+            index = coordinates[list(group)]
+            spread[index] = np.sqrt((spread[index] ** 2).mean())
+    spread[spread < 1e-6] = 1.0
+    return seen.shape[1:], tuple(center.tolist()), tuple(spread.tolist()), places
+
+
+def _places(observations: Shaped[Array, "N S"], achieved: Shaped[Array, "N G"]) -> tuple[int, ...]:
+    """Return for each entry of the goal that of the observation which it always is; or nothing."""
+    same = (observations[:, :, None] == achieved[:, None, :]).all(0)
+    same &= (np.ptp(achieved, axis=0) > 0)[None]  # what never changes is no evidence
+    return tuple(same.argmax(0).tolist()) if same.any(0).all() else ()
 
 
 def _checked_actions(name: str, space: gymnasium.Space[Any], bound: float | None) -> spaces.Box:

@@ -48,6 +48,7 @@ class Probes:
         desired: The goal of every moment ``(N, G)``.
         word: What info says of success ``(N,)``: 1, 0, or -1 for nothing.
         key: Where info says so, nothing where it does not.
+        observation: The observation of every moment ``(N, S)``, or images.
         goal_is_observation: Whether the achieved goal was the observation itself, always.
         seconds: Median time of one step.
     """
@@ -56,6 +57,7 @@ class Probes:
     desired: Array
     word: Array
     key: str
+    observation: Array
     goal_is_observation: bool
     seconds: float
 
@@ -133,6 +135,7 @@ def probe(
         desired=np.stack([m.entries[f"desired_{kind}"] for m in moments]),
         word=np.array([m.word for m in moments]),
         key=next((m.key for m in moments if m.key), ""),
+        observation=np.stack([m.entries["observation"] for m in moments]),
         goal_is_observation=same,
         seconds=float(np.median(durations)),
     )

@@ -3,7 +3,7 @@
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import gymnasium
 
@@ -12,7 +12,7 @@ from midway.envs.views import MazeView, TableView, View
 from midway.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from midway.envs.foreign import Foreign
+    from midway.envs.foreign import EnvLike, Foreign
     from midway.envs.vector import GoalVectorEnv
 
 
@@ -38,15 +38,27 @@ class Declaration:
     description: str
     tasks: tuple[str, ...]
     entry_point: str
-    arguments: dict[str, str] = field(default_factory=dict, hash=False)
+    arguments: dict[str, object] = field(default_factory=dict, hash=False)
     view: View | None = None
     steps: int = 32_000
 
-    def factory(self, **options: int | str) -> "GoalVectorEnv":
-        """Return the vector environment with ``num_envs``, ``task`` and ``num_threads``."""
+    @property
+    def foreign(self) -> "Foreign | None":
+        """What was decided about an environment that is not midway's."""
+        return cast("Foreign | None", self.arguments.get("foreign"))
+
+    @property
+    def shown_task(self) -> str:
+        """The task that is evaluated and shown if none is named: the hard one, if there is one."""
+        return "hard" if "hard" in self.tasks else self.tasks[0]
+
+    def factory(
+        self, num_envs: int = 1, task: str = "uniform", num_threads: int = 0
+    ) -> "GoalVectorEnv":
+        """Return environments that are stepped together, as `make_vec`."""
         module, name = self.entry_point.split(":")
         made: Callable[..., GoalVectorEnv] = getattr(importlib.import_module(module), name)
-        return made(**self.arguments, **options)
+        return made(**self.arguments, num_envs=num_envs, task=task, num_threads=num_threads)
 
 
 def _in_mazes(
@@ -111,8 +123,8 @@ def register_ids() -> None:
         )
 
 
-def entry(env: "str | Foreign") -> Declaration:
-    """Return the declaration of an environment, by its name or as `foreign.describe` returned it.
+def entry(env: "EnvLike") -> Declaration:
+    """Return the declaration of an environment.
 
     Raises:
         ConfigurationError: There is none of this name, or midway cannot use it.
@@ -122,7 +134,7 @@ def entry(env: "str | Foreign") -> Declaration:
     from midway.envs import foreign, sources
 
     try:
-        described = foreign.described(env) if isinstance(env, str) else env
+        described = env if isinstance(env, foreign.Foreign) else foreign.described(env)
     except sources.UnknownEnvironmentError as error:
         raise ConfigurationError(
             f"{error}; midway's own are {', '.join(ENVIRONMENTS)}, and any goal environment goes "
@@ -140,12 +152,12 @@ def entry(env: "str | Foreign") -> Declaration:
 
 
 def make_vec(
-    name: "str | Foreign", num_envs: int = 1, task: str = "uniform", num_threads: int = 0
+    name: "EnvLike", num_envs: int = 1, task: str = "uniform", num_threads: int = 0
 ) -> "GoalVectorEnv":
     """Return environments that are stepped together.
 
     Args:
-        name: A name of the registry, such as ``point-u``, or what ``foreign.describe`` returned.
+        name: A name of the registry, such as ``point-u``, or another environment.
         num_envs: Number of environments.
         task: A task of the environment: what starts and goals are drawn from.
         num_threads: Threads that simulate; 0 chooses. Results do not depend on it.
@@ -153,4 +165,4 @@ def make_vec(
     Raises:
         ConfigurationError: An unknown name or task, or ``num_envs`` below 1.
     """
-    return entry(name).factory(num_envs=num_envs, task=task, num_threads=num_threads)
+    return entry(name).factory(num_envs, task, num_threads)

@@ -169,6 +169,14 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
         info = self._info(achieved, desired, terminated, everyone)
         return observations, reward, terminated, truncated, info
 
+    def rest(self, mask: Bool[Array, " num_envs"]) -> Observations:
+        """Ask no more of these copies, whose episodes are over, until they are reset.
+
+        Returns:
+            The observations of every copy. All are stepped together, so these begin anew.
+        """
+        return self.reset(options={"reset_mask": mask})[0]
+
     def success_pair(self, observations: Mapping[str, Array]) -> tuple[Array, Array]:
         """Return what success is measured on: the states where there are any, else the goals."""
         kind = "goal" if self.goal_spec.state_shape is None else "state"

@@ -53,32 +53,44 @@ class EncoderConfig(Protocol):
 
 
 class StateEncoder(eqx.Module):
-    """States relative to the environment's origin, in its unit: the state itself in most."""
+    """States relative to the environment's origin, in its unit: the state itself in most.
+
+    Attributes:
+        origin: Middle of the states; nothing for zeros.
+        unit: What one unit of the features is, for all entries or for each.
+        bound: Largest feature.
+        goal_coordinates: Entries of a state that make a goal, where goals are not states; both are
+            told apart by their length.
+    """
 
     origin: tuple[float, ...] = eqx.field(static=True)
     unit: float | tuple[float, ...] = eqx.field(static=True)
     bound: float = eqx.field(static=True, default=math.inf)
+    goal_coordinates: tuple[int, ...] = eqx.field(static=True, default=())
 
     def __call__(self, observation: Float[Array, "*B S"]) -> Float[Array, "*B S"]:
         """Return (state - origin) / unit, within ± bound."""
-        features = (observation - self._shift) / self._unit
+        shift, unit = self._of(observation.shape[-1])
+        features = (observation - shift) / unit
         return features if math.isinf(self.bound) else jnp.clip(features, -self.bound, self.bound)
 
     def states(self, features: Float[Array, "*B S"]) -> Float[Array, "*B S"]:
         """Return the states that features stand for, in the units of the environment."""
-        return features * self._unit + self._shift
+        shift, unit = self._of(features.shape[-1])
+        return features * unit + shift
 
     def spread(self, scale: Float[Array, "*B S"]) -> Float[Array, "*B S"]:
         """Return scales of features in the units of the environment."""
-        return scale * self._unit
+        return scale * self._of(scale.shape[-1])[1]
 
-    @property
-    def _unit(self) -> Float[Array, "..."]:
-        return jnp.asarray(self.unit)
-
-    @property
-    def _shift(self) -> Float[Array, "..."]:
-        return jnp.asarray(self.origin) if self.origin else jnp.zeros(())
+    def _of(self, size: int) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return origin and unit of states or goals of this length."""
+        shift = jnp.asarray(self.origin) if self.origin else jnp.zeros(())
+        unit = jnp.asarray(self.unit)
+        if self.goal_coordinates and size == len(self.goal_coordinates):
+            index = jnp.asarray(self.goal_coordinates)
+            shift, unit = (x[index] if x.ndim else x for x in (shift, unit))
+        return shift, unit
 
     def augment(self, observation: Float[Array, "B S"], key: Key[Array, ""]) -> Float[Array, "B S"]:
         """Return the observation: states are not augmented."""
@@ -175,7 +187,7 @@ def create(spec: EnvSpec, config: EncoderConfig, key: Key[Array, ""]) -> Encoder
             )
         return ImageEncoder(spec.observation_shape, config, key=key)
     if config.normalise and spec.spread:
-        return StateEncoder(spec.center, spec.spread, LARGEST_FEATURE)
+        return StateEncoder(spec.center, spec.spread, LARGEST_FEATURE, spec.goal_coordinates)
     return StateEncoder(spec.origin, spec.unit)
 
 
@@ -186,29 +198,36 @@ def feature_sizes(spec: EnvSpec) -> tuple[int, int]:
     return spec.observation_shape[0], spec.goal_shape[0]
 
 
-def scale(encoder: Encoder) -> float:
-    """Return how many of the environment's units one unit of the first feature is."""
+def scale(encoder: Encoder, entry: int = 0) -> float:
+    """Return how many of the environment's units one unit of a feature is."""
     unit = getattr(encoder, "unit", 1.0)
-    return float(unit[0] if isinstance(unit, tuple) else unit)
+    return float(unit[entry] if isinstance(unit, tuple) else unit)
 
 
 def subgoal_size(spec: EnvSpec) -> int:
-    """Return the length of a subgoal as one vector: of both roles where they differ."""
+    """Return the length of a subgoal as one vector: of both roles where both are needed."""
     observation, goal = feature_sizes(spec)
-    return observation if spec.goal_is_observation else observation + goal
+    return observation if _state_tells(spec) else observation + goal
+
+
+def _state_tells(spec: EnvSpec) -> bool:
+    """Return whether the state of a subgoal tells the goal that it is reached as."""
+    return spec.goal_is_observation or bool(spec.goal_coordinates)
 
 
 def as_subgoal(spec: EnvSpec, vector: Float[Array, "*B S"]) -> Subgoal:
     """Split a vector into the state it is started from and the goal it is reached as."""
     if spec.goal_is_observation:
         return Subgoal(vector, vector)
+    if spec.goal_coordinates:
+        return Subgoal(vector, vector[..., jnp.asarray(spec.goal_coordinates)])
     size = feature_sizes(spec)[0]
     return Subgoal(vector[..., :size], vector[..., size:])
 
 
 def as_vector(spec: EnvSpec, subgoal: Subgoal) -> Shaped[Array, "*B S"]:
     """Join both roles of a subgoal into one vector."""
-    if spec.goal_is_observation:
+    if _state_tells(spec):
         return subgoal.observation
     return jnp.concatenate(subgoal, axis=-1)
 

@@ -1,11 +1,14 @@
 """What networks read of a state and a goal: the whole goal, or where it lies (beyond the paper)."""
 
+from dataclasses import replace
 from typing import Literal, TypeAlias, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from midway.networks import encoder as encoders
+from midway.networks.encoder import Encoder
 from midway.types import DistanceTask, EnvSpec
 
 GoalInputs: TypeAlias = Literal["whole", "coordinates", "relative"]
@@ -19,15 +22,21 @@ class PairInputs(eqx.Module):
         groups: Coordinates of each distance that success is measured by; none for the whole goal.
         near: Distance that counts as reached, in the units of the features; 0 leaves out where the
             goal lies from the state.
+        places: Entry of the state for each coordinate of a goal, where goals are not states.
     """
 
     groups: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
     near: float = eqx.field(static=True, default=0.0)
+    places: tuple[int, ...] = eqx.field(static=True, default=())
 
     @property
     def coordinates(self) -> tuple[int, ...]:
-        """The coordinates of all groups."""
-        return tuple(index for group in self.groups for index in group)
+        """The entries of the state in all groups."""
+        return tuple(place for group in self.groups for place in self.in_state(group))
+
+    def in_state(self, group: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the entries of the state that these coordinates of a goal are."""
+        return tuple(self.places[index] for index in group) if self.places else group
 
     def __call__(
         self, observation: Float[Array, "*#B S"], goal: Float[Array, "*#B G"]
@@ -39,10 +48,10 @@ class PairInputs(eqx.Module):
         """
         if not self.groups:
             return observation, goal
-        parts = [self.pick(goal)]
+        parts = [goal[..., jnp.asarray(group)] for group in self.groups]
         for group in self.groups if self.near else ():
-            index = jnp.asarray(group)
-            offset = goal[..., index] - observation[..., index]
+            place = jnp.asarray(self.in_state(group))
+            offset = goal[..., jnp.asarray(group)] - observation[..., place]
             distance = jnp.sqrt((offset**2).sum(-1, keepdims=True) + 1e-6)
             parts += [offset, offset / (distance + self.near), jnp.log(distance + self.near / 2)]
         leading = jnp.broadcast_shapes(*(part.shape[:-1] for part in parts))
@@ -57,7 +66,7 @@ class PairInputs(eqx.Module):
         return len(self.coordinates) + relative
 
     def pick(self, vector: Float[Array, "*B S"]) -> Float[Array, "*B C"]:
-        """Return the coordinates of states or goals; all of them where the whole goal is read."""
+        """Return these coordinates of states; all entries where the whole goal is read."""
         return vector[..., jnp.asarray(self.coordinates)] if self.groups else vector
 
     def embed(
@@ -77,20 +86,24 @@ class PairInputs(eqx.Module):
         return self.embed(jnp.zeros_like(observation), scale)
 
 
-def create(spec: EnvSpec, inputs: GoalInputs, scale: float) -> PairInputs:
+def create(spec: EnvSpec, inputs: GoalInputs, encoder: Encoder) -> PairInputs:
     """Return how networks read the goals of an environment.
 
-    Goals are read whole where they are no observations, or where success is not measured by
+    Goals are read whole where no state tells its own goal, or where success is not measured by
     distances between their coordinates.
 
     Args:
         spec: The environment.
         inputs: What the configuration asks for.
-        scale: How many of the environment's units one unit of the features is.
+        encoder: What makes the features, for their units.
     """
-    if inputs == "whole" or not spec.goal_is_observation or spec.state_shape is not None:
+    known = spec.goal_is_observation or spec.goal_coordinates
+    if inputs == "whole" or not known or spec.state_shape is not None:
         return PairInputs()
     if not isinstance(spec.task, DistanceTask):
         return PairInputs()
-    near = spec.task.threshold / scale if inputs == "relative" else 0.0
-    return PairInputs(spec.task.groups, near)
+    read = PairInputs(spec.task.groups, places=spec.goal_coordinates)
+    if inputs == "coordinates":
+        return read
+    near = spec.task.threshold / encoders.scale(encoder, read.coordinates[0])
+    return replace(read, near=near)

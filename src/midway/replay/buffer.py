@@ -62,7 +62,7 @@ def begin(replay: ReplayState, observation: Observation, mask: Bool[AnyArray, " 
     first = jnp.where(unused, newest_first, replay.num_rows)
 
     replay = write(replay, first, _goal_row(replay, observation), mask)
-    replay = write(replay, first + 1, _state_row(replay, observation), mask)
+    replay = write(replay, first + 1, _state_row(replay, observation, jnp.zeros_like(mask)), mask)
     episode = insert(replay.episode, first, serial, mask)
     return replay._replace(
         episode=insert(episode, first + 1, serial, mask),
@@ -81,12 +81,14 @@ def add(
     """Append one step to the running episode of each masked lane.
 
     The action goes into the lane's newest row, the observation ``(K, ...)`` after the step becomes
-    the next row. Lanes where no episode was begun are left alone.
+    the next row. Lanes where no episode was begun are left alone. An observation has ``failed``
+    where the environment may end an episode without success.
     """
     mask = jnp.asarray(mask) & (replay.num_episodes > 0)
     position = replay.num_rows
+    failed = jnp.asarray(observation.get("failed", jnp.zeros_like(mask)))
     replay = write(replay, position - 1, {"action": action}, mask)
-    replay = write(replay, position, _state_row(replay, observation), mask)
+    replay = write(replay, position, _state_row(replay, observation, failed), mask)
     return replay._replace(
         episode=insert(replay.episode, position, replay.num_episodes - 1, mask),
         num_rows=position + mask,
@@ -143,12 +145,13 @@ def sample(
     following = (pairs.lane, pairs.position + steps)
     outcome = Outcome(read(replay, truth, *following), desired)
     reward, terminated = spec.task(*outcome)
+    failed = read(replay, "failed", *following) & ~terminated if spec.can_fail else None
     between = rows_between(pairs, others, ahead, goal_key)
     return Batch(
         observation=read(replay, "observation", *current),
         action=read(replay, "action", *current),
         reward=reward,
-        terminated=terminated,
+        terminated=terminated if failed is None else terminated | failed,
         next_observation=read(replay, "observation", *following),
         goal=read(replay, goals, *goal),
         subgoal_candidate=Subgoal(
@@ -158,6 +161,7 @@ def sample(
         steps=steps.astype(jnp.float32) if wanted.n_step > 1 else None,
         reached_in=ahead.astype(jnp.float32) if wanted.reached_in else None,
         between=read(replay, "observation", *between) if wanted.between else None,
+        failed=failed,
     )
 
 
@@ -196,12 +200,17 @@ def _row_kinds(spec: EnvSpec) -> dict[str, tuple[tuple[int, ...], str]]:
         kinds["achieved_goal"] = (spec.goal_shape, "float32")
     if spec.state_shape is not None:
         kinds["achieved_state"] = (spec.state_shape, "float32")
+    if spec.can_fail:
+        kinds["failed"] = ((), "bool")
     return kinds
 
 
-def _state_row(replay: ReplayState, observation: Observation) -> Observation:
+def _state_row(
+    replay: ReplayState, observation: Observation, failed: Bool[Array, " K"]
+) -> Observation:
     """Return the parts of an observation that the row of a state holds."""
-    return {name: observation[name] for name in replay.rows if name != "action"}
+    shown = {**observation, "failed": failed}
+    return {name: shown[name] for name in replay.rows if name != "action"}
 
 
 def _goal_row(replay: ReplayState, observation: Observation) -> Observation:

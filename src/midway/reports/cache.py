@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from midway import tables
-from midway.envs import registry as environments
 from midway.envs.geodesic import geodesic_distance
 from midway.envs.mazes import ROBOT_RADIUS, Maze
 from midway.envs.views import MazeView, TableView
@@ -230,7 +229,7 @@ class Study:
     def _hard_pair(self) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, " G"]]:
         """Return state and goal in the middle of the boxes of the hard task."""
         start, goal = self.ends()
-        env = environments.make_vec(self.run.config.env)
+        env = self.run.config.declaration().factory()
         options = {"task": "hard", "start": tuple(start.tolist()), "goal": tuple(goal.tolist())}
         observation, _ = env.reset(seed=SEED, options=options)
         return observation["observation"][0], observation["desired_goal"][0]

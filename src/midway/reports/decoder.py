@@ -18,7 +18,6 @@ import optax
 from jaxtyping import Array, Float, Int, Key, PyTree, Shaped, UInt8
 
 from midway.agent import Encoder, PretrainSettings
-from midway.envs import registry as environments
 from midway.errors import ConfigurationError
 from midway.networks.decoder import ImageDecoder, loss
 from midway.runs.folder import RunFolder
@@ -99,7 +98,7 @@ def fit(policy: Policy, encoder: Encoder) -> ImageDecoder:
     """Return a decoder fitted to the features of an encoder; the run's seed decides all."""
     # The seeds of training, evaluation and pre-training come from other hashes.
     env_seed, key_seed = np.random.SeedSequence((policy.config.seed, 3)).generate_state(2)
-    env = environments.make_vec(policy.config.env, num_envs=NUM_ENVS)
+    env = policy.config.declaration().factory(num_envs=NUM_ENVS)
     images = jnp.asarray(sample_images(env, IMAGES, int(env_seed)))
     return fit_to(_apply(encoder, images), images, jax.random.key(int(key_seed)), UPDATES)
 

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from midway.agent import AgentState, PretrainSettings
-from midway.envs import registry as environments
 from midway.envs.views import MazeView, TableView
 from midway.networks.decoder import ImageDecoder
 from midway.reports import maze as maps
@@ -120,7 +119,7 @@ def draw(study: Study, label: str) -> Figure:
 
 def rows(policy: Policy, decoder: ImageDecoder, task: str, count: int, seed: int) -> Rows:
     """Return the rows of one task: imagined subgoals where the agent has them."""
-    env = environments.make_vec(policy.config.env, num_envs=count, task=task)
+    env = policy.config.declaration().factory(num_envs=count, task=task)
     observation, _ = env.reset(seed=seed)
     pair = observation["observation"], observation["desired_goal"]
     seen = {"state": pair[0], "state,\ndecoded": reconstructed(policy, decoder, pair[0])}
@@ -168,7 +167,7 @@ def reconstructions(
     policy: Policy,
 ) -> tuple[Shaped[np.ndarray, "N ..."], Float[np.ndarray, "N ..."]]:
     """Return new states and what is left of them after encoding and decoding."""
-    env = environments.make_vec(policy.config.env, num_envs=IMAGES)
+    env = policy.config.declaration().factory(num_envs=IMAGES)
     count = IMAGES if policy.spec.is_image else STATES
     assert policy.agent.pretrain is not None
     states = sample_states(env, PretrainSettings((), count, ACTIONS, rounds=0), SEED)

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from midway.agent import AgentState, AnyAgent, Memory, SubgoalDistribution
-from midway.envs import registry as environments
 from midway.runs.policy import Policy
 from midway.training.evaluate import rollout
 from midway.types import NumPyArray, VectorGoalEnv
@@ -67,7 +66,7 @@ def record(policy: Policy, episodes: Mapping[str, int], seed: int) -> list[Recor
         seed: The same seed gives the same starts and goals.
     """
     tasks = np.repeat(list(episodes), list(episodes.values()))
-    env = environments.make_vec(policy.config.env, num_envs=len(tasks))
+    env = policy.config.declaration().factory(num_envs=len(tasks))
     observation = _reset(env, tasks, seed)
     goals, targets = observation["desired_goal"].copy(), env.success_pair(observation)[1].copy()
     seen = [(observation["observation"].copy(), env.success_pair(observation)[0].copy())]

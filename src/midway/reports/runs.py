@@ -92,7 +92,7 @@ class RunData:
     def view(self) -> View | None:
         """How the environment is drawn; None if nobody knows."""
         with suppress(ConfigurationError):  # its package may be missing here
-            return environments.entry(self.config.env).view
+            return self.config.declaration().view
         return None
 
     def evaluated(self, task: str, actions: str) -> Table:

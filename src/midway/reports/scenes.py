@@ -13,7 +13,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.text import Text
 
-from midway.envs import registry as environments
 from midway.envs.views import MazeView, TableView
 from midway.errors import ConfigurationError
 from midway.reports import decoder, style, tabletop
@@ -59,7 +58,7 @@ def maker(folder: RunFolder, policy: Policy, title: str) -> MakeScene:
     Raises:
         ConfigurationError: There is no scene of the policy's environment.
     """
-    view = environments.entry(policy.config.env).view
+    view = policy.config.declaration().view
     if isinstance(view, MazeView):
         return lambda recording: MazeScene(view, title, policy, recording)
     if isinstance(view, TableView) and policy.spec.is_image:

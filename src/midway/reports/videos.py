@@ -38,13 +38,14 @@ RENDERING = ("PYOPENGL_PLATFORM", "MUJOCO_GL")
 """Variables that this process may have set to draw without a display."""
 
 
-def watch(path: Path, out: Path | None, task: str, episodes: int, seed: int) -> Path:
+def watch(path: Path, out: Path | None, task: str | None, episodes: int, seed: int) -> Path:
     """Write a video of a trained policy, which acts deterministically.
 
     Args:
         path: The run folder.
         out: The file, ``.mp4`` or ``.gif``; default: ``videos/TASK.mp4`` in the run folder.
-        task: ``hard``, ``uniform`` or a named case of the environment.
+        task: ``hard``, ``uniform`` or a named case of the environment; None: the hard one, if there
+            is one.
         episodes: Number of episodes, one after the other.
         seed: Seed of starts and goals.
 
@@ -55,6 +56,7 @@ def watch(path: Path, out: Path | None, task: str, episodes: int, seed: int) -> 
         ConfigurationError: The folder, task, number or file cannot be used.
     """
     run = read(path)
+    task = task or run.config.declaration().shown_task
     out = out or run.folder.path / "videos" / f"{task}.mp4"
     if out.suffix not in RATES:
         raise ConfigurationError(f"{out}: a video is named {' or '.join(RATES)}")
@@ -63,7 +65,7 @@ def watch(path: Path, out: Path | None, task: str, episodes: int, seed: int) -> 
     return out
 
 
-def show(path: Path, task: str, episodes: int, seed: int) -> None:
+def show(path: Path, task: str | None, episodes: int, seed: int) -> None:
     """Show the same in a window, until the last episode has ended or the window is closed.
 
     Args:
@@ -76,6 +78,7 @@ def show(path: Path, task: str, episodes: int, seed: int) -> None:
         ConfigurationError: As in ``watch``, or there is no display here.
     """
     run = read(path)
+    task = task or run.config.declaration().shown_task
     check_display()
     frames, rate = film(run, task, episodes, seed, RATES[".mp4"])
     play(frames, rate, f"midway: {path}")

@@ -3,7 +3,7 @@
 from midway import tables
 from midway.errors import ConfigurationError
 from midway.runs.folder import RunConfig, RunFolder, read_json
-from midway.training.arrays import said_of
+from midway.training.arrays import checked_arrays
 from midway.training.checkpoint import steps_in
 
 
@@ -21,7 +21,8 @@ def policy_step(folder: RunFolder) -> int | None:
     """Return the step of the saved policy; None unless both of its files are whole and agree."""
     try:
         step = read_json(folder.policy_config).get("step")
-        if said_of(folder.policy_weights).get("step", step) != step:
+        _, said = checked_arrays(folder.policy_weights)
+        if said.get("step", step) != step:
             return None
     except ConfigurationError:
         return None

@@ -16,6 +16,9 @@ from pathlib import Path
 
 from midway import files
 from midway.agents import registry
+from midway.envs import registry as environments
+from midway.envs.foreign import Foreign
+from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
 from midway.runs import lock
 from midway.settings import changed
@@ -46,6 +49,8 @@ class RunConfig:
         seed: The one seed of every generator.
         train: Settings of the loop.
         hyperparameters: The agent's ``Config``.
+        foreign: What was decided about an environment that is not midway's, as JSON; None for
+            midway's own, and for one that no other process could make.
     """
 
     env: str
@@ -54,6 +59,23 @@ class RunConfig:
     seed: int
     train: TrainConfig
     hyperparameters: Hyperparameters
+    foreign: JsonObject | None = None
+
+    def declaration(self) -> Declaration:
+        """Return the declaration of the environment.
+
+        Raises:
+            ConfigurationError: It cannot be found.
+        """
+        if self.foreign is None:
+            return environments.entry(self.env)
+        return environments.entry(Foreign.from_json(self.foreign))
+
+    @property
+    def rule_of_success(self) -> str:
+        """What counts as success in an environment that is not midway's, in one line."""
+        foreign = self.declaration().foreign
+        return "" if foreign is None else foreign.description
 
     def to_json(self) -> JsonObject:
         """Return plain values."""
@@ -83,6 +105,7 @@ class RunConfig:
                 seed=values["seed"],
                 train=changed(TrainConfig(), values["train"]),
                 hyperparameters=changed(agent.Config(), values["hyperparameters"]),
+                foreign=values.get("foreign"),
             )
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigurationError(f"configuration not understood: {error}") from error

@@ -116,23 +116,34 @@ def load_arrays(path: Path, tree: Tree, about: Mapping[str, object] | None = Non
     Raises:
         ConfigurationError: The file cannot be read, was changed, or holds other arrays.
     """
-    said = said_of(path)
+    arrays, said = checked_arrays(path)
     for name, expected in (about or {}).items():
         if said.get(name) != expected:
             raise ConfigurationError(
                 f"{path} is of another run: {name} {said.get(name)!r}, expected {expected!r}"
             )
+    return with_named_arrays(tree, arrays)
+
+
+def checked_arrays(path: Path) -> tuple[dict[str, NumPyArray], JsonObject]:
+    """Return the arrays of a file by name, and what it says of itself.
+
+    Raises:
+        ConfigurationError: The file cannot be read, or was changed.
+    """
+    said = said_of(path)
     try:
-        arrays = load_file(path)
+        arrays: dict[str, NumPyArray] = load_file(path)
     except (OSError, SafetensorError) as error:
         raise ConfigurationError(f"{path} cannot be read: {error}") from error
-    for name, expected in said.get("arrays", {}).items():
-        if name in arrays and (found := _checksum(arrays[name])) != expected:
+    expected = said.get("arrays", {})
+    for name in expected.keys() & arrays.keys():
+        if (found := _checksum(arrays[name])) != expected[name]:
             raise ConfigurationError(
                 f"{path} is damaged: SHA-256 of {name} {files.short(found)}, "
-                f"expected {files.short(expected)}"
+                f"expected {files.short(expected[name])}"
             )
-    return with_named_arrays(tree, arrays)
+    return arrays, said
 
 
 @contextmanager

@@ -149,11 +149,12 @@ class Checkpoints:
         except ConfigurationError as error:
             whole = next((s for s in reversed(self.steps()) if s < wanted and self._whole(s)), None)
             offer = (
-                "no older one is whole: --from 0 starts anew"
+                "no older one is whole, to start anew"
                 if whole is None
-                else f"that of step {whole} is whole: --from {whole} continues from it"
+                else f"that of step {whole} is whole, to go on from it"
             )
-            raise ConfigurationError(f"{error}; {offer}") from None
+            command = f"midway resume {self._folder.parent} --from {whole or 0}"
+            raise ConfigurationError(f"{error}; {offer}: {command}") from None
         return wanted
 
     def verify(self, step: int) -> None:

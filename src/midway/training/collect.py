@@ -75,13 +75,14 @@ class Collector:
         for name, column in self.env.logged_info.items():
             self.logged[column] += (info[name].sum(), self.env.num_envs)
         everyone = np.ones(self.env.num_envs, np.bool_)
-        replay = step.add(replay, actions, self.observation, everyone)
+        failed = {"failed": info["failed"]} if "failed" in info else {}
+        replay = step.add(replay, actions, self.observation | failed, everyone)
         ended = terminated | truncated
         if self.limit:
             ended = ended | (info["elapsed_steps"] >= self.limit)
         if ended.any():
             self.counts.episodes += int(ended.sum())
-            self.counts.successes += int(terminated.sum())
+            self.counts.successes += int((info["is_success"] & ended).sum())
             self.counts.length += int(info["elapsed_steps"][ended].sum())
             self.observation, _ = self.env.reset(options={"reset_mask": ended})
             replay = step.begin(replay, self.observation, ended)

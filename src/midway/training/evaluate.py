@@ -88,7 +88,7 @@ class Moment(NamedTuple):
 def rollout(env: VectorGoalEnv, actor: Policy, observation: Observations) -> Iterator[Moment]:
     """Yield the steps of one episode in each environment, until the last one has ended.
 
-    An environment that is done goes round again, unrecorded, and the actor rests there.
+    An environment that is done rests, and so does the actor there.
 
     Args:
         env: A vector environment without autoreset, just reset.
@@ -101,10 +101,10 @@ def rollout(env: VectorGoalEnv, actor: Policy, observation: Observations) -> Ite
         action = np.asarray(actor(observation["observation"], observation["desired_goal"]))
         observation, _, terminated, truncated, info = env.step(action)
         over = terminated | truncated
-        yield Moment(observation, info, running.copy(), over & running, terminated)
+        yield Moment(observation, info, running.copy(), over & running, info["is_success"])
         running &= ~over
         if over.any():
-            observation, _ = env.reset(options={"reset_mask": over})
+            observation = env.rest(over)
             rest(~running)
 
 

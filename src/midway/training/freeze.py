@@ -77,6 +77,10 @@ class FrozenEnv:
         observation, info = self.env.reset(seed=seed, options=options)
         return self.see(observation), info
 
+    def rest(self, mask: NumPyArray) -> Observations:
+        """Ask no more of these environments."""
+        return self.see(self.env.rest(mask))
+
     def step(self, actions: NumPyArray) -> Step:
         """Take a step in every environment."""
         observation, reward, terminated, truncated, info = self.env.step(actions)
