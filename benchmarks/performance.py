@@ -30,7 +30,7 @@ RESULTS = Path(__file__).parent / "results" / "speed" / "midway.json"
 ONE_CORE = ("taskset", "--cpu-list", "0")
 PRECISIONS = ("bf16", "f32")
 BATCHES = (256, 512, 1024, 2048, 4096)
-COPIES = (1, 8, 64, 256)
+NUM_ENVS = (1, 8, 64, 256)
 PROCESSES = 3
 """That measure each update."""
 
@@ -66,7 +66,7 @@ def update(env: str, batch: int, precision: str, prefix: tuple[str, ...] = ()) -
 
 
 def environment(num_envs: int, prefix: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return how many steps copies of the ant take in a second."""
+    """Return how many steps parallel ants take in a second."""
     arguments = ("--env", "ant-u", "--num-envs", str(num_envs))
     return {"num_envs": num_envs, **bench("env", *arguments, prefix=prefix)["env"]}
 
@@ -166,7 +166,7 @@ PARTS: dict[str, Callable[[], list[dict[str, Any]]]] = {
     "update_one_core": lambda: [update("ant-u", b, "bf16", ONE_CORE) for b in (256, 2048)],
     "update_images": lambda: [update("push", 256, p) for p in PRECISIONS],
     "split": lambda: [split(batch) for batch in (256, 2048)],
-    "environment": lambda: [environment(n) for n in COPIES],
+    "environment": lambda: [environment(n) for n in NUM_ENVS],
     "environment_one_core": lambda: [environment(64, ONE_CORE)],
     "loop": loops,
     "memory": lambda: [memory(env) for env in ("ant-u", "push")],

@@ -3,7 +3,8 @@
     python benchmarks/summary.py benchmarks/results/point-mazes
 
 Success is that of the last evaluation, lowest and highest of all seeds. Minutes are training time
-until an evaluation on the hard task first reached 95 % with mean actions, of the slowest seed.
+until an evaluation on the hard task first reached 95 % with the deterministic policy, of the
+slowest seed.
 """
 
 import argparse

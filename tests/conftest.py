@@ -22,6 +22,9 @@ hypothesis.settings.load_profile("midway")
 MAY_SKIP = "MIDWAY_TESTS_MAY_SKIP"
 """Environment variable: with ``no``, as in CI, a skipped test fails the session."""
 
+MUCH = 1_000_000_000
+"""Bytes in memory that a worker lets go of its compiled programs at, before the next test."""
+
 peaks = pytest.StashKey[list[int]]()
 
 
@@ -38,6 +41,20 @@ def compiled_programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def memory_of_one_file(compiled_programs: Path) -> Iterator[None]:
     """Let go of a file's compiled programs when it is through: they would pile up to GiBs."""
     yield
+    let_go()
+
+
+@pytest.fixture(autouse=True)
+def memory_of_one_test() -> Iterator[None]:
+    """Let go of compiled programs inside a file as well, where it has become much."""
+    yield
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    if pages * resource.getpagesize() > MUCH:
+        let_go()
+
+
+def let_go() -> None:
+    """Free all compiled programs; those that are needed again come from the session's cache."""
     jax.clear_caches()
     gc.collect()
     give_back_memory()

@@ -31,7 +31,7 @@ FLOORS = (
 
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
 
-AGENT_FLOORS = ({"beyond"}, {"ris", "sac", "tdm", "crl"}, {"leap"}, {"registry"})
+AGENT_FLOORS = ({"beyond", "entropy"}, {"ris", "sac", "tdm", "crl"}, {"leap"}, {"registry"})
 """The same within agents/: LEAP is built on TDM, and the registry names them all."""
 
 AGENT_FLOOR = {agent: level for level, agents in enumerate(AGENT_FLOORS) for agent in agents}

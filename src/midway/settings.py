@@ -175,8 +175,11 @@ def _example(old: tuple[object, ...]) -> object:
 
 def _of_parts(name: str, old: Hyperparameters, value: Any) -> Hyperparameters:
     """Return a group of settings, such as the relabelling shares, from its parts."""
+    listed = ", ".join(names(old))
+    refused = ConfigurationError(f"{name} {value!r}: one value for each of {listed}")
+    if not value:  # no part at all would mean the defaults, in silence
+        raise refused
     try:
         return type(old)(**value) if isinstance(value, Mapping) else type(old)(*value)
     except TypeError:
-        listed = ", ".join(names(old))
-        raise ConfigurationError(f"{name} {value!r}: one value for each of {listed}") from None
+        raise refused from None

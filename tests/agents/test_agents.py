@@ -11,7 +11,7 @@ import pytest
 
 from midway import functional
 from midway.agent import Agent
-from midway.agents import beyond, leap, registry, ris, sac, tdm
+from midway.agents import beyond, crl, leap, registry, ris, sac, tdm
 from midway.errors import ConfigurationError
 from midway.types import Subgoal
 
@@ -35,7 +35,7 @@ def changed(before, after) -> set[str]:
 
 
 def test_registry_knows_the_agents():
-    modules = {"ris": ris, "sac": sac, "tdm": tdm, "leap": leap}
+    modules = {"ris": ris, "sac": sac, "tdm": tdm, "leap": leap, "crl": crl}
     for name, module in modules.items():
         agent = registry.get(name)
         assert agent is module.AGENT
@@ -44,19 +44,20 @@ def test_registry_knows_the_agents():
         assert registry.name_of(agent) == registry.name_of(name) == name
         with pytest.raises(FrozenInstanceError):
             agent.networks = ()
-    assert set(modules) <= set(registry.AGENTS)
+    assert set(modules) == set(registry.AGENTS)
 
 
 def test_abilities_are_fields_that_can_be_asked_for():
     asked = {
         name: {a for a in ABILITIES if getattr(registry.AGENTS[name], a) is not None}
-        for name in ("ris", "sac", "tdm", "leap")
+        for name in registry.AGENTS
     }
     assert asked == {
         "ris": {"value", "subgoals", "freezing"},
         "sac": {"value", "freezing"},
         "tdm": {"value", "memory", "freezing"},
         "leap": {"value", "memory", "pretrain", "freezing"},
+        "crl": {"value", "freezing"},
     }
     assert leap.AGENT.memory.plan is not None
     assert tdm.AGENT.memory.plan is None

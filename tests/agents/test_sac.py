@@ -11,7 +11,7 @@ import scipy.integrate
 import scipy.stats
 
 from midway import functional
-from midway.agents import sac
+from midway.agents import entropy, sac
 from midway.networks.policies import Gaussian
 
 KEY = jax.random.key(7)
@@ -79,7 +79,7 @@ def test_policy_loss_by_hand(sac_case):
 
 def test_entropy_loss_has_no_gradient_into_the_entropy():
     arguments = (jnp.asarray(0.5), jnp.asarray(-3.0))
-    to_coefficient, to_entropy = jax.grad(sac.entropy_loss, argnums=(0, 1))(*arguments, -2.0)
+    to_coefficient, to_entropy = jax.grad(entropy.loss, argnums=(0, 1))(*arguments, -2.0)
     assert to_coefficient == -3.0 - -2.0
     assert to_entropy == 0
 

@@ -9,6 +9,7 @@ import pytest
 from test_foreign import TINY
 
 import midway
+from midway import reports
 from midway.envs.examine import examine
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "your-own-task.md"
@@ -36,4 +37,8 @@ def test_the_environment_of_the_document(boat: str, tmp_path: Path) -> None:
         boat, agent="sac", steps=60, out=tmp_path / "run", changes=TINY | {"replay_capacity": 900}
     )
     assert run.finished
-    assert len(midway.evaluate(run.path, episodes=2, task="uniform").episodes) == 2
+    assert len(midway.evaluate(run.path, episodes=2).episodes) == 2
+    assert reports.report([run.path])
+    video = reports.watch(run.path)
+    assert video.name == "uniform.mp4"
+    assert video.stat().st_size > 1000

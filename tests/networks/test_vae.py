@@ -19,6 +19,20 @@ SPECS = {
 }
 
 
+@pytest.fixture(scope="module")
+def image_vae():
+    return vae.ImageVAE(4, key=KEY)
+
+
+# Compiled whole: layer by layer, in every size, takes minutes and a gigabyte.
+encoded, decoded = eqx.filter_jit(vae.ImageVAE.encode), eqx.filter_jit(vae.ImageVAE.decode)
+
+
+@eqx.filter_jit
+def reconstruction_error(model, states):
+    return model.error(states, model.decode(model.encode(states).mean)).mean()
+
+
 def trained(model, states, kl_weight, steps, rate=3e-3, batch=64):
     """Return the autoencoder after some steps of Adam."""
 
@@ -30,7 +44,7 @@ def trained(model, states, kl_weight, steps, rate=3e-3, batch=64):
         gradient = eqx.filter_grad(lambda m: vae.loss(m, rows, noise, kl_weight)[0])(model)
         return optimizer.step(model, gradient, state, rate), None
 
-    model_latents = model.encode(states[:1]).mean.shape[1]
+    model_latents = eqx.filter_eval_shape(type(model).encode, model, states[:1]).mean.shape[1]
     carry = (model, optimizer.init(model))
     return jax.jit(lambda c, k: jax.lax.scan(step, c, k))(carry, jax.random.split(KEY, steps))[0][0]
 
@@ -95,15 +109,15 @@ def test_loss_is_error_plus_weighted_divergence():
 
 
 def test_image_layers_have_the_sizes_of_the_appendix():
-    model = vae.ImageVAE(16, key=KEY)
-    images = jnp.zeros((2, *IMAGE))
+    model = eqx.filter_eval_shape(vae.ImageVAE, 16, key=KEY)
+    images = jax.ShapeDtypeStruct((2, *IMAGE), jnp.float32)
     sizes = [images.shape[1:]]
     for layer in model.encoder:
-        images = layer.reduce(images)
+        images = eqx.filter_eval_shape(vae.Filter.reduce, layer, images)
         sizes.append(images.shape[1:])
     assert sizes == [(84, 84, 3), (27, 27, 16), (8, 8, 16), (2, 2, 32)]
     for layer in model.decoder:
-        images = layer.enlarge(images)
+        images = eqx.filter_eval_shape(vae.Filter.enlarge, layer, images)
         sizes.append(images.shape[1:])
     assert sizes[4:] == [(8, 8, 32), (27, 27, 16), (84, 84, 3)]
     assert [layer.weight.shape[0] for layer in model.encoder] == [5, 5, 5]
@@ -119,50 +133,50 @@ def test_enlarging_is_the_transpose_of_reducing(kernel, stride):
     weight = there.weight.swapaxes(2, 3)
     back = eqx.tree_at(lambda f: (f.weight, f.bias), back, (weight, jnp.zeros(2)))
     small = jax.random.normal(KEY, (2, 4, 5, 3))
-    enlarged = back.enlarge(small)
+    enlarged = eqx.filter_jit(vae.Filter.enlarge)(back, small)
     assert enlarged.shape == (2, 3 * stride + kernel, 4 * stride + kernel, 2)
     large = jax.random.normal(jax.random.key(1), enlarged.shape)
-    products = (there.reduce(large) * small).sum(), (large * enlarged).sum()
+    reduced = eqx.filter_jit(vae.Filter.reduce)(there, large)
+    products = np.vdot(reduced, small), np.vdot(large, enlarged)
     np.testing.assert_allclose(*products, rtol=1e-4)
 
 
-def test_images_are_decoded_in_blocks_without_a_trace():
-    model = vae.ImageVAE(4, key=KEY)
+def test_images_are_decoded_in_blocks_without_a_trace(image_vae):
     latent = jax.random.normal(KEY, (vae.BLOCK + 3, 4))
-    one_by_one = jnp.concatenate([model.decode(row[None]) for row in latent])
-    np.testing.assert_allclose(model.decode(latent), one_by_one, atol=1e-5)
+    one_by_one = np.concatenate([decoded(image_vae, row[None]) for row in latent])
+    np.testing.assert_allclose(decoded(image_vae, latent), one_by_one, atol=1e-5)
 
 
-def test_image_values_may_be_bytes_or_shares():
-    model = vae.ImageVAE(16, key=KEY)
-    image = jax.random.randint(KEY, (3, *IMAGE), 0, 256).astype(jnp.uint8)
-    latent = model.encode(image)
-    assert latent.mean.shape == latent.log_variance.shape == (3, 16)
-    np.testing.assert_allclose(latent.mean, model.encode(image / 255.0).mean, atol=1e-5)
+def test_image_values_may_be_bytes_or_shares(image_vae):
+    image = np.random.default_rng(0).integers(0, 256, (3, *IMAGE), np.uint8)
+    share = np.asarray(image / 255, np.float32)
+    latent = encoded(image_vae, image)
+    assert latent.mean.shape == latent.log_variance.shape == (3, 4)
+    np.testing.assert_allclose(latent.mean, encoded(image_vae, share).mean, atol=1e-5)
     assert latent.log_variance.min() >= np.log(1e-4) - 1e-5
-    error = model.error(image, image / 255.0 + 0.1)
+    error = eqx.filter_jit(vae.ImageVAE.error)(image_vae, image, share + np.float32(0.1))
     np.testing.assert_allclose(error, 84 * 84 * 3 * 0.01, rtol=1e-4)
 
 
-def test_images_of_a_moving_square_are_reconstructed():
-    def image(corner):
-        return jnp.zeros(IMAGE).at[corner[0] : corner[0] + 30, corner[1] : corner[1] + 30].set(255)
-
+def test_images_of_a_moving_square_are_reconstructed(image_vae):
     corners = [(row, column) for row in (0, 25, 50) for column in (0, 25, 50)]
-    images = jnp.stack([image(corner) for corner in corners]).astype(jnp.uint8)
-    model = vae.ImageVAE(4, key=KEY)
-    before = model.error(images, model.decode(model.encode(images).mean)).mean()
-    model = trained(model, images, 1e-3, 120, batch=8)
-    after = model.error(images, model.decode(model.encode(images).mean)).mean()
+    images = np.zeros((len(corners), *IMAGE), np.uint8)
+    for image, (row, column) in zip(images, corners, strict=True):
+        image[row : row + 30, column : column + 30] = 255
+    before = reconstruction_error(image_vae, images)
+    after = reconstruction_error(
+        trained(image_vae, jnp.asarray(images), 1e-3, 120, batch=8), images
+    )
     assert after < 0.3 * before
 
 
 @pytest.mark.parametrize(("kind", "size"), [("states", 5), ("pairs", 7), ("images", None)])
 def test_create_suits_the_environment(kind, size):
-    model = vae.create(SPECS[kind], 3, (16, 8), KEY)
+    model = eqx.filter_eval_shape(lambda key: vae.create(SPECS[kind], 3, (16, 8), key), KEY)
     if size is None:
         assert isinstance(model, vae.ImageVAE)
         return
-    assert model.decode(jnp.zeros((4, 3))).shape == (4, size)
+    latent = jax.ShapeDtypeStruct((4, 3), jnp.float32)
+    assert eqx.filter_eval_shape(vae.StateVAE.decode, model, latent).shape == (4, size)
     assert [layer.weight.shape[1] for layer in model.encoder.layers] == [16, 8, 6]
     assert [layer.weight.shape[1] for layer in model.decoder.layers] == [8, 16, size]

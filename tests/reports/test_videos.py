@@ -7,8 +7,7 @@ import pytest
 from midway import api
 from midway.errors import ConfigurationError
 from midway.reports import videos, watch
-from midway.reports.cache import chain
-from midway.reports.recordings import draws, record
+from midway.reports.recordings import chain, draws, record
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio's reader

@@ -6,7 +6,7 @@ how likely it is at all. There is no reward and no bootstrapping: goals of a bat
 the discounted future of its states (`RelabelMix.future_discount`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ import optax
 from jaxtyping import Array, Float, Key, Shaped
 
 from midway.agent import Agent, Freezing, Value
+from midway.agents import entropy
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
 from midway.networks.encoder import Encoder
@@ -136,8 +137,8 @@ def policy_loss(
     action, log_density = policy(batch.observation, goal).squashed(noise)
     logit = state.critic(batch.observation, action, goal)
     loss = (jnp.exp(state.log_entropy_coefficient) * log_density - logit).mean()
-    entropy = -log_density.mean()
-    return loss, (entropy, {"policy/loss": loss, "policy/entropy": entropy})
+    estimate = -log_density.mean()
+    return loss, (estimate, {"policy/loss": loss, "policy/entropy": estimate})
 
 
 def policy_goals(goal: Float[Array, "B G"], random_share: float) -> Float[Array, "B G"]:
@@ -165,25 +166,8 @@ def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metr
 def update_policy(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
     """Step the policy, then the entropy coefficient towards the target entropy."""
     noise = jax.random.normal(key, batch.action.shape)
-    old, rate = (state.policy, state.policy_optimizer), state.config.policy_learning_rate
-    policy, policy_optimizer, (entropy, metrics) = optimizer.minimise(
-        policy_loss, *old, rate, state, batch, noise
-    )
     target = state.config.target_entropy * state.spec.action_dim
-    log_c, entropy_optimizer = optimizer.step(
-        state.log_entropy_coefficient,
-        jax.lax.stop_gradient(entropy) - target,
-        state.entropy_optimizer,
-        state.config.entropy_learning_rate,
-    )
-    state = replace(
-        state,
-        policy=policy,
-        policy_optimizer=policy_optimizer,
-        log_entropy_coefficient=log_c,
-        entropy_optimizer=entropy_optimizer,
-    )
-    return state, metrics | {"policy/entropy_coefficient": jnp.exp(log_c)}
+    return entropy.step_policy_and_coefficient(policy_loss, state, target, batch, noise)
 
 
 # --- act and create -------------------------------------------------------------------------------

@@ -119,7 +119,7 @@ def subgoal_cost(state: State, batch: Batch, subgoal: Subgoal) -> Float[Array, "
 def subgoal_advantage(
     state: State, batch: Batch, mean_subgoal: Float[Array, "B S"]
 ) -> Float[Array, " B"]:
-    """Return the cost of the current mean subgoal minus the cost of the candidate."""
+    """Return the cost of the current mean subgoal minus the cost of the candidate (eq. 11)."""
     mean = as_subgoal(state, batch.observation, mean_subgoal)
     return subgoal_cost(state, batch, mean) - subgoal_cost(state, batch, batch.subgoal_candidate)
 
@@ -134,8 +134,7 @@ def subgoal_loss(
     subgoals = subgoal_policy(batch.observation, batch.goal)
     advantage = jax.lax.stop_gradient(subgoal_advantage(state, batch, subgoals.location))
     weight = functional.advantage_weights(advantage, state.config.advantage_temperature)
-    candidate = encoders.as_vector(state.spec, batch.subgoal_candidate)
-    candidate = subgoal_policy.inputs.pick(candidate)
+    candidate = subgoal_policy.inputs.pick(encoders.as_vector(state.spec, batch.subgoal_candidate))
     loss = functional.subgoal_loss(subgoals.log_density(candidate), weight)
     return loss, {
         "subgoal/loss": loss,
@@ -178,7 +177,7 @@ def policy_loss(
 
 def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
     """Return the state after one gradient step of every network, and scalars to log."""
-    encoding_key, target_key, subgoal_key, action_key = jax.random.split(key, 4)
+    encoding_key, target_key, *policy_keys = jax.random.split(key, 4)
     config, done = state.config, optimizer.updates(state.critic_optimizer)
     observation, batch = encoders.encode_batch(state.encoder, batch, encoding_key)
     state, features, critic_metrics = update_critic(state, observation, batch, target_key)
@@ -189,8 +188,7 @@ def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metr
     )
     due = partial(beyond.every, done)
     state, subgoal_metrics = due(config.subgoal_every, update_subgoal_policy, state, batch)
-    keys = (subgoal_key, action_key)
-    state, policy_metrics = due(config.policy_every, update_policy, state, batch, *keys)
+    state, policy_metrics = due(config.policy_every, update_policy, state, batch, *policy_keys)
     return update_targets(state), critic_metrics | subgoal_metrics | policy_metrics
 
 
@@ -225,7 +223,7 @@ def update_policy(
 
 
 def imagine(state: State, batch: Batch, key: Key[Array, ""]) -> Subgoal:
-    """Return I subgoals s_g^i ~ π^H_ψ(· | s, g) for each pair, ``(B, I, S)``, without gradient."""
+    """Return I subgoals s_g^i ~ π^H_ψ(· | s, g) of each pair (eq. 18), without gradient."""
     subgoals = state.subgoal_policy(batch.observation, batch.goal)
     drawn = jax.lax.stop_gradient(subgoals.sample(key, state.config.num_subgoals))
     return as_subgoal(state, batch.observation[:, None], drawn)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Key, Shaped
 
 from midway import functional
 from midway.agent import Agent, Freezing, Value
-from midway.agents import beyond
+from midway.agents import beyond, entropy
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
 from midway.networks.critics import TwinCritic
@@ -95,15 +95,8 @@ def policy_loss(
     action, log_density = policy(batch.observation, batch.goal).squashed(noise)
     q = state.critic(batch.observation, action, batch.goal).min(0)
     loss = (jnp.exp(state.log_entropy_coefficient) * log_density - q).mean()
-    entropy = -log_density.mean()
-    return loss, (entropy, {"policy/loss": loss, "policy/entropy": entropy})
-
-
-def entropy_loss(
-    log_entropy_coefficient: Float[Array, ""], entropy: Float[Array, ""], target: float
-) -> Float[Array, ""]:
-    """Return log c times what the entropy exceeds its target by."""
-    return log_entropy_coefficient * (jax.lax.stop_gradient(entropy) - target)
+    estimate = -log_density.mean()
+    return loss, (estimate, {"policy/loss": loss, "policy/entropy": estimate})
 
 
 def value(
@@ -146,27 +139,8 @@ def update_critic(
 def update_policy(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metrics]:
     """Step the policy, then the entropy coefficient towards the target entropy -dim(A)."""
     noise = jax.random.normal(key, batch.action.shape)
-    old, rate = (state.policy, state.policy_optimizer), state.config.policy_learning_rate
-    policy, policy_optimizer, (entropy, metrics) = optimizer.minimise(
-        policy_loss, *old, rate, state, batch, noise
-    )
-    entropy_gradient = jax.grad(entropy_loss)(
-        state.log_entropy_coefficient, entropy, -float(state.spec.action_dim)
-    )
-    log_entropy_coefficient, entropy_optimizer = optimizer.step(
-        state.log_entropy_coefficient,
-        entropy_gradient,
-        state.entropy_optimizer,
-        state.config.entropy_learning_rate,
-    )
-    state = replace(
-        state,
-        policy=policy,
-        policy_optimizer=policy_optimizer,
-        log_entropy_coefficient=log_entropy_coefficient,
-        entropy_optimizer=entropy_optimizer,
-    )
-    return state, metrics | {"policy/entropy_coefficient": jnp.exp(log_entropy_coefficient)}
+    target = -float(state.spec.action_dim)
+    return entropy.step_policy_and_coefficient(policy_loss, state, target, batch, noise)
 
 
 # --- act and create -------------------------------------------------------------------------------

@@ -82,10 +82,10 @@ def medians(pieces: dict[str, Piece], repetitions: int = REPETITIONS) -> Figures
 
 
 def update(env: str, agent: str, batch: int, precision: str) -> Figures:
-    """Time one update, with sampling and relabelling, and compare it with its products alone.
+    """Time one update, sampling and relabelling included, beside its matrix products alone.
 
     Where observations are images, also time one on their features, as with a frozen encoder.
-    The limit is the time that the products would take at the rate of a product of 2048 x 256 by
+    The limit is the time that the matrix products would take at the rate of one of 2048 x 256 by
     256 x 256 in the same precision, measured in turn with the update.
 
     Args:
@@ -138,7 +138,7 @@ def environment(env: str, num_envs: int) -> Figures:
 
     Args:
         env: Environment.
-        num_envs: Copies.
+        num_envs: Parallel environments.
     """
     vector = environments.make_vec(env, num_envs=num_envs)
     vector.reset(seed=0)
@@ -348,7 +348,7 @@ def _products(jaxpr: Any) -> list[float]:
 
 
 def _reference_product(precision: str) -> Piece:
-    """Return ten products of 2048 x 256 by 256 x 256 in one call, as a function of no arguments."""
+    """Return a function of ten matrix products of 2048 x 256 by 256 x 256 in one call."""
     dtype = jnp.bfloat16 if precision == "bf16" else jnp.float32
     x = jnp.ones((2048, 256), dtype)
     weight = jnp.ones((256, 256), dtype)

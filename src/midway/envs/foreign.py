@@ -80,6 +80,12 @@ class Foreign:
         return given == (None, None)
 
     @property
+    def draws(self) -> bool:
+        """Whether the environment draws itself."""
+        metadata = getattr(judge(self.source), "metadata", {})
+        return "rgb_array" in metadata.get("render_modes", ())
+
+    @property
     def description(self) -> str:
         """What counts as success, as one line for the user."""
         return f"{self.spec.name}: a goal is reached {self.rule.description}"

@@ -53,12 +53,13 @@ class Declaration:
         return "hard" if "hard" in self.tasks else self.tasks[0]
 
     def factory(
-        self, num_envs: int = 1, task: str = "uniform", num_threads: int = 0
+        self, num_envs: int = 1, task: str = "uniform", num_threads: int = 0, **others: object
     ) -> "GoalVectorEnv":
-        """Return environments that are stepped together, as `make_vec`."""
+        """Return environments that are stepped together, as `make_vec`; others are its class's."""
         module, name = self.entry_point.split(":")
         made: Callable[..., GoalVectorEnv] = getattr(importlib.import_module(module), name)
-        return made(**self.arguments, num_envs=num_envs, task=task, num_threads=num_threads)
+        options = {"num_envs": num_envs, "task": task, "num_threads": num_threads, **others}
+        return made(**self.arguments, **options)
 
 
 def _in_mazes(

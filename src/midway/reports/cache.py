@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -183,11 +183,11 @@ class Study:
 
     def chain(self) -> Table:
         """Return the positions of the subgoal chain of the hard task."""
-        return self._way("chain", lambda start, goal: chain(self.policy, start, goal, CHAIN_DEPTH))
+        return self._way("chain", partial(recordings.chain, self.policy, depth=CHAIN_DEPTH))
 
     def plan(self) -> Table:
         """Return the positions of the subgoals that are planned for the hard task."""
-        return self._way("plan", lambda start, goal: first_plan(self.policy, start, goal))
+        return self._way("plan", partial(recordings.first_plan, self.policy))
 
     def ends(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
         """Return the positions of start and goal in the middle of the hard task's boxes (m)."""
@@ -325,40 +325,6 @@ class Cache:
             self.note(f"{name}: the policy cannot be used: {error}")
             return None
         return study
-
-
-def chain(
-    policy: Policy, observation: Float[np.ndarray, " S"], goal: Float[np.ndarray, " G"], depth: int
-) -> Float[np.ndarray, "N G"]:
-    """Return the way from a state to a goal, imagined by halving it ``depth`` times.
-
-    Args:
-        policy: A policy that imagines.
-        observation: The state.
-        goal: The goal.
-        depth: A chain of depth 1 is one subgoal; each further one imagines between the last.
-
-    Returns:
-        ``2 ** depth - 1`` achieved goals, from the state to the goal.
-    """
-    if depth == 0:
-        return np.empty((0, *goal.shape))
-    middle = policy.subgoals(observation[None], goal[None]).location
-    reached, onwards = np.asarray(middle.achieved_goal), np.asarray(middle.observation)
-    before = chain(policy, observation, reached[0], depth - 1)
-    after = chain(policy, onwards[0], goal, depth - 1)
-    return np.concatenate([before, reached, after])
-
-
-def first_plan(
-    policy: Policy, observation: Float[np.ndarray, " S"], goal: Float[np.ndarray, " G"]
-) -> Float[np.ndarray, "N G"]:
-    """Return the subgoals planned between a state and a goal, as an episode begins."""
-    actor = policy.actor()
-    actor(observation[None], goal[None])
-    found = recordings.plan(policy, actor.memory)
-    assert found is not None
-    return np.asarray(found[0])
 
 
 def grid(maze: Maze) -> tuple[Float[np.ndarray, " columns"], Float[np.ndarray, " rows"]]:

@@ -22,6 +22,7 @@ from midway.errors import ConfigurationError
 from midway.networks.decoder import ImageDecoder, loss
 from midway.runs.folder import RunFolder
 from midway.runs.policy import Policy
+from midway.training import seeds
 from midway.training.arrays import load_arrays, named_arrays, save_arrays
 from midway.training.pretrain import sample_states
 from midway.types import AnyArray, VectorGoalEnv
@@ -96,11 +97,10 @@ def digest(policy: Policy, encoder: Encoder) -> UInt8[np.ndarray, " n"]:
 
 def fit(policy: Policy, encoder: Encoder) -> ImageDecoder:
     """Return a decoder fitted to the features of an encoder; the run's seed decides all."""
-    # The seeds of training, evaluation and pre-training come from other hashes.
-    env_seed, key_seed = np.random.SeedSequence((policy.config.seed, 3)).generate_state(2)
+    env_seed, key = seeds.decoder(policy.config.seed)
     env = policy.config.declaration().factory(num_envs=NUM_ENVS)
-    images = jnp.asarray(sample_images(env, IMAGES, int(env_seed)))
-    return fit_to(_apply(encoder, images), images, jax.random.key(int(key_seed)), UPDATES)
+    images = jnp.asarray(sample_images(env, IMAGES, env_seed))
+    return fit_to(_apply(encoder, images), images, key, UPDATES)
 
 
 def decoded(

@@ -1,7 +1,8 @@
 """Episodes of a saved policy, recorded step by step, with the subgoals on their way."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeAlias, TypeVar
 
 import equinox as eqx
@@ -16,6 +17,9 @@ from midway.types import NumPyArray, VectorGoalEnv
 Found = TypeVar("Found")
 
 Array: TypeAlias = NumPyArray
+
+LARGEST_PICTURE = 480
+"""Pixels of the longer side of what environments draw of themselves, at most."""
 
 SUBGOALS = 20
 """Imagined subgoals that are drawn for a state and a goal."""
@@ -35,6 +39,7 @@ class Recording:
         success: Whether the goal was reached.
         final_distance: Distance to the goal at the end (m).
         plans: Subgoals that the agent followed ``(T, N, ...)``, where it plans any.
+        pictures: What the environment itself draws of every state, where it was asked to.
     """
 
     task: str
@@ -45,6 +50,7 @@ class Recording:
     success: bool
     final_distance: float
     plans: Array | None = None
+    pictures: Sequence[Array] = ()
 
     @property
     def length(self) -> int:
@@ -57,30 +63,53 @@ class Recording:
         return "imagined" if self.plans is None else "planned"
 
 
-def record(policy: Policy, episodes: Mapping[str, int], seed: int) -> list[Recording]:
+def record(
+    policy: Policy, episodes: Mapping[str, int], seed: int, draw: bool = False
+) -> list[Recording]:
     """Run episodes of the deterministic policy, all at once.
 
     Args:
         policy: The policy, in the environment that it was trained for.
         episodes: Number of episodes of each task.
         seed: The same seed gives the same starts and goals.
+        draw: Whether the environment is to draw itself; one that is not midway's and can.
     """
     tasks = np.repeat(list(episodes), list(episodes.values()))
-    env = policy.config.declaration().factory(num_envs=len(tasks))
+    factory = partial(policy.config.declaration().factory, num_envs=len(tasks))
+    env = factory(render_mode="rgb_array") if draw else factory()
     observation = _reset(env, tasks, seed)
     goals, targets = observation["desired_goal"].copy(), env.success_pair(observation)[1].copy()
     seen = [(observation["observation"].copy(), env.success_pair(observation)[0].copy())]
-    actor, plans = policy.actor(), []
-    lengths = np.zeros(len(tasks), np.int64)
+    actor, plans, reached = policy.actor(), [], np.zeros(len(tasks), np.bool_)
+    lengths, drawn = np.zeros(len(tasks), np.int64), [pictures(env)]
     for moment in rollout(env, actor, observation):
         states = env.success_pair(moment.observation)[0]
         seen.append((moment.observation["observation"].copy(), states.copy()))
         plans.append(plan(policy, actor.memory))
+        drawn.append(pictures(env))
         lengths += moment.running
-    return [
+        reached |= moment.ended & moment.success
+    env.close()
+    recordings = [
         _recording(policy, seen, plans, number, lengths, task, goals[number], targets[number])
         for number, task in enumerate(tasks.tolist())
     ]
+    return [
+        replace(
+            recording,
+            success=bool(reached[number]),
+            pictures=[each[number] for each in drawn[: recording.length + 1] if each],
+        )
+        for number, recording in enumerate(recordings)
+    ]
+
+
+def pictures(env: VectorGoalEnv) -> list[Array]:
+    """Return what each environment draws, no larger than needed; nothing if it was not asked to."""
+    render = getattr(env, "render", None)
+    drawn = render() if render is not None and getattr(env, "render_mode", None) else None
+    steps = [-(-max(picture.shape[:2]) // LARGEST_PICTURE) for picture in drawn or ()]
+    return [picture[::s, ::s].copy() for picture, s in zip(drawn or (), steps, strict=True)]
 
 
 def _recording(
@@ -105,7 +134,7 @@ def _recording(
         goal=goal,
         states=states,
         target=target,
-        success=bool(measure(*ends)[1][0]),
+        success=False,
         final_distance=float(measure.distance(*ends)[0]),
         plans=np.stack(followed) if followed else None,
     )
@@ -166,3 +195,37 @@ def in_every_state(policy: Policy, recording: Recording) -> Float[np.ndarray, "T
     if policy.agent.subgoals is None:
         return None
     return draws(imagined(policy, recording), SUBGOALS)
+
+
+def chain(
+    policy: Policy, observation: Float[np.ndarray, " S"], goal: Float[np.ndarray, " G"], depth: int
+) -> Float[np.ndarray, "N G"]:
+    """Return the way from a state to a goal, imagined by halving it ``depth`` times.
+
+    Args:
+        policy: A policy that imagines.
+        observation: The state.
+        goal: The goal.
+        depth: A chain of depth 1 is one subgoal; each further one imagines between the last.
+
+    Returns:
+        ``2 ** depth - 1`` achieved goals, from the state to the goal.
+    """
+    if depth == 0:
+        return np.empty((0, *goal.shape))
+    middle = policy.subgoals(observation[None], goal[None]).location
+    reached, onwards = np.asarray(middle.achieved_goal), np.asarray(middle.observation)
+    before = chain(policy, observation, reached[0], depth - 1)
+    after = chain(policy, onwards[0], goal, depth - 1)
+    return np.concatenate([before, reached, after])
+
+
+def first_plan(
+    policy: Policy, observation: Float[np.ndarray, " S"], goal: Float[np.ndarray, " G"]
+) -> Float[np.ndarray, "N G"]:
+    """Return the subgoals planned between a state and a goal, as an episode begins."""
+    actor = policy.actor()
+    actor(observation[None], goal[None])
+    found = plan(policy, actor.memory)
+    assert found is not None
+    return np.asarray(found[0])

@@ -14,7 +14,6 @@ from matplotlib.patches import Circle
 from matplotlib.text import Text
 
 from midway.envs.views import MazeView, TableView
-from midway.errors import ConfigurationError
 from midway.reports import decoder, style, tabletop
 from midway.reports import maze as maps
 from midway.reports.decoder import Images
@@ -54,9 +53,6 @@ def maker(folder: RunFolder, policy: Policy, title: str) -> MakeScene:
         folder: The run folder.
         policy: Its policy, asked for subgoals in every state if it imagines any.
         title: What is shown.
-
-    Raises:
-        ConfigurationError: There is no scene of the policy's environment.
     """
     view = policy.config.declaration().view
     if isinstance(view, MazeView):
@@ -66,7 +62,7 @@ def maker(folder: RunFolder, policy: Policy, title: str) -> MakeScene:
         return lambda recording: ImageScene(title, policy, recording, decode)
     if isinstance(view, TableView):
         return lambda recording: TableScene(title, policy, recording)
-    raise ConfigurationError(f"{policy.config.env} has no view, so no videos are made of it")
+    return lambda recording: GoalScene(title, policy, recording)
 
 
 class Stage:
@@ -255,13 +251,91 @@ class ImageScene:
         return self._stage.frame()
 
 
+class GoalScene:
+    """The way of the achieved goal in its first two coordinates, beside the environment's picture.
+
+    A goal of one coordinate is shown over time.
+
+    Args:
+        title: What is shown.
+        policy: The policy, asked for subgoals in every state if it imagines any.
+        recording: The episode.
+    """
+
+    def __init__(self, title: str, policy: Policy, recording: Recording) -> None:
+        self._path = _on_plane(recording.states)
+        found = None if policy.spec.is_image else in_every_state(policy, recording)
+        self._subgoals = None if found is None else _on_plane(found)
+        self._pictures = recording.pictures
+        self._kind = recording.kind
+        self._words = Words(policy, recording, unit=0.0)
+        columns = 2 if len(self._pictures) else 1
+        figure, (axes, *beside) = style.figure(1, columns, height=4.6, width=4.2 * columns)
+        style.label(axes, f"{title}\n", *_names(recording.target))
+        axes.plot(*_on_plane(recording.target[None])[-1:].T, "*", markersize=16, color=maps.GOAL)
+        shown = [self._path, _on_plane(recording.target[None])]
+        low, high = np.concatenate(shown).min(0), np.concatenate(shown).max(0)
+        rim = 0.15 * max(float((high - low).max()), 1e-6)
+        axes.set(xlim=(low[0] - rim, high[0] + rim), ylim=(low[1] - rim, high[1] + rim))
+        self._trail, self._agent, self._marks = (
+            axes.plot([], [], **look)[0]
+            for look in (
+                {"color": style.BLUE, "linewidth": 2, "zorder": 4},
+                {"color": style.BLUE, "marker": "o", "markersize": 9, "zorder": 7},
+                {**_diamonds(), "zorder": 6},
+            )
+        )
+        for panel in beside:
+            panel.set_axis_off()
+        self._images = [panel.imshow(self._pictures[0]) for panel in beside]
+        style.legend_below(figure, self._legend())
+        self._text = _text(axes)
+        moving = [self._trail, self._agent, self._marks, *self._images, self._text]
+        self._stage = Stage(figure, moving)
+
+    def frame(self, step: int) -> Frame:
+        """Return the picture after so many steps."""
+        self._trail.set_data(*self._path[: step + 1].T)
+        self._agent.set_data(*self._path[step : step + 1].T)
+        if self._subgoals is not None:
+            self._marks.set_data(*self._subgoals[step].T)
+        for image in self._images:
+            image.set_data(self._pictures[step])
+        self._text.set_text(self._words.after(step))
+        return self._stage.frame()
+
+    def _legend(self) -> list[Line2D]:
+        look: style.Look = {"color": style.BLUE, "marker": "o", "markersize": 9, "linewidth": 2}
+        goal: style.Look = {"linestyle": "", "color": maps.GOAL, "marker": "*", "markersize": 14}
+        entries = [
+            Line2D([], [], label="achieved goal", **look),
+            Line2D([], [], label="goal", **goal),
+        ]
+        if self._subgoals is not None:
+            entries.append(Line2D([], [], label=f"{self._kind} subgoals", **_diamonds()))
+        return entries
+
+
+def _on_plane(goals: Float[np.ndarray, "*B G"]) -> Float[np.ndarray, "*B 2"]:
+    """Return the first two coordinates of goals; of a single one, its place in time before it."""
+    if goals.shape[-1] > 1:
+        return goals[..., :2]
+    time = np.arange(len(goals), dtype=float).reshape(-1, *[1] * (goals.ndim - 1))
+    return np.concatenate([np.broadcast_to(time, goals.shape), goals], axis=-1)
+
+
+def _names(goal: Float[np.ndarray, " G"]) -> tuple[str, str]:
+    """Return what the axes of a plane of goals are."""
+    return ("goal[0]", "goal[1]") if len(goal) > 1 else ("step", "goal[0]")
+
+
 class Words:
     """What is said of every step: how far the goal is.
 
     Args:
         policy: The policy, whose task measures distances.
         recording: The episode.
-        unit: 1 for metres, 0.01 for centimetres.
+        unit: 1 for metres, 0.01 for centimetres, 0 where the unit is not known.
     """
 
     def __init__(self, policy: Policy, recording: Recording, unit: float) -> None:
@@ -276,10 +350,9 @@ class Words:
         """Return the words after so many steps."""
         if step == self._end:
             return f"step {step}, goal reached"
-        unit = "m" if self._unit == 1 else "cm"
-        digits = 1 if self._unit == 1 else 0
+        unit, digits = {1.0: (" m", 1), 0.01: (" cm", 0), 0.0: ("", 3)}[self._unit]
         parts = (
-            f"{name + ' ' if name else ''}{distances[step] / self._unit:.{digits}f} {unit}"
+            f"{name + ' ' if name else ''}{distances[step] / (self._unit or 1.0):.{digits}f}{unit}"
             for name, distances in self._distances.items()
         )
         return f"step {step}, {', '.join(parts)} to the goal"

@@ -38,7 +38,13 @@ RENDERING = ("PYOPENGL_PLATFORM", "MUJOCO_GL")
 """Variables that this process may have set to draw without a display."""
 
 
-def watch(path: Path, out: Path | None, task: str | None, episodes: int, seed: int) -> Path:
+def watch(
+    path: Path,
+    out: Path | None = None,
+    task: str | None = None,
+    episodes: int = 1,
+    seed: int = 0,
+) -> Path:
     """Write a video of a trained policy, which acts deterministically.
 
     Args:
@@ -65,7 +71,7 @@ def watch(path: Path, out: Path | None, task: str | None, episodes: int, seed: i
     return out
 
 
-def show(path: Path, task: str | None, episodes: int, seed: int) -> None:
+def show(path: Path, task: str | None = None, episodes: int = 1, seed: int = 0) -> None:
     """Show the same in a window, until the last episode has ended or the window is closed.
 
     Args:
@@ -98,7 +104,8 @@ def film(
     (label,) = agent_labels([run.config.agent])
     title = f"{label} on {run.config.env}, {task}"
     make = scenes.maker(run.folder, policy, title)
-    recordings = record(policy, {task: episodes}, seed)
+    foreign = run.config.declaration().foreign
+    recordings = record(policy, {task: episodes}, seed, draw=bool(foreign and foreign.draws))
     longest = max(recording.length for recording in recordings)
     rate = int(np.clip(longest / SECONDS, *rates))
     stride = max(1, round(longest / SECONDS / rate))

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Key
 
-PRETRAINING, EVALUATION = 2, 1
+PRETRAINING, EVALUATION, DECODER = 2, 1, 3
 """What tells these streams apart from each other and from those of training."""
 
 
@@ -41,10 +41,19 @@ def training(seed: int) -> Streams:
 
 def pretraining(seed: int) -> tuple[int, Key[Array, ""]]:
     """Return the seed of the states that are pre-trained on, and the key of its updates."""
-    env, key = np.random.SeedSequence((seed, PRETRAINING)).generate_state(2)
-    return int(env), jax.random.key(int(key))
+    return _env_and_key(seed, PRETRAINING)
+
+
+def decoder(seed: int) -> tuple[int, Key[Array, ""]]:
+    """Return the seed of the images that a decoder is fitted to, and the key of its updates."""
+    return _env_and_key(seed, DECODER)
 
 
 def evaluation(seed: int) -> int:
     """Return the seed of the environments of `midway evaluate`, which no training meets."""
     return int(np.random.SeedSequence((seed, EVALUATION)).generate_state(1)[0])
+
+
+def _env_and_key(seed: int, stream: int) -> tuple[int, Key[Array, ""]]:
+    env, key = np.random.SeedSequence((seed, stream)).generate_state(2)
+    return int(env), jax.random.key(int(key))
