@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from midway.envs.packages import PACKAGES
+
 ROOT = Path(__file__).parents[1]
 SOURCE, TESTS = ROOT / "src" / "midway", ROOT / "tests"
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -39,7 +41,7 @@ EXTRAS = {
     name: requirements(lines)
     for name, lines in PYPROJECT["project"]["optional-dependencies"].items()
 }
-DEV = EXTRAS.pop("dev")
+DEV, ROBOTICS = EXTRAS.pop("dev"), EXTRAS.pop("robotics")
 OPTIONAL = {name for extra in EXTRAS.values() for name in extra}
 
 
@@ -76,6 +78,10 @@ def test_the_package_imports_what_it_declares() -> None:
 
 def test_what_an_extra_installs_is_imported_where_it_is_needed() -> None:
     assert {name for name, inside in found_in(SOURCE, OPTIONAL) if not inside} & OPTIONAL == set()
+
+
+def test_the_extra_of_environments_holds_the_packages_that_are_found_by_their_ids() -> None:
+    assert set(ROBOTICS) == set(map(canonical, PACKAGES))
 
 
 def test_the_tests_import_what_is_declared() -> None:

@@ -14,6 +14,7 @@ _PUBLIC = {
     "load": "midway.api",
     "evaluate": "midway.api",
     "goal_env": "midway.api",
+    "maze_env": "midway.api",
     "make_vec": "midway.envs.registry",
 }
 

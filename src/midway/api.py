@@ -7,11 +7,12 @@ from pathlib import Path
 from midway import presets
 from midway.agent import AnyAgent
 from midway.agents import registry as agents
-from midway.envs import foreign
+from midway.envs import foreign, layouts
 from midway.envs import registry as environments
 from midway.envs.foreign import EnvLike, Foreign, Settings
 from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
+from midway.runs import complete
 from midway.runs import policy as policies
 from midway.runs.folder import RunConfig, RunFolder, run_name
 from midway.runs.policy import Policy
@@ -68,6 +69,21 @@ def goal_env(
     return foreign.admit(foreign.describe(env, said, kwargs, tuple(imports)))
 
 
+def maze_env(robot: str, maze: str | Path) -> Declaration:
+    """Return an environment of a robot in a maze of one's own, for `train` and `make_vec`.
+
+    Args:
+        robot: ``point`` or ``ant``.
+        maze: A file of letters (``#`` wall, ``.`` free, ``S`` start and ``G`` goal of the hard
+            task), or of YAML with them as ``map`` and the side of a cell as ``cell`` (m); or
+            ``umaze`` or ``medium``, which are gymnasium-robotics'.
+
+    Raises:
+        ConfigurationError: There is no such robot, or the file holds no map of a maze.
+    """
+    return environments.own_maze(robot, layouts.read(maze))
+
+
 def configure(
     env: EnvLike | Declaration,
     agent: str | AnyAgent = "ris",
@@ -91,15 +107,20 @@ def configure(
     if type(seed) is not int or not 0 <= seed < 2**63:
         raise ConfigurationError(f"seed {seed!r}: must be a whole number from 0 to 2**63 - 1")
     name = agents.name_of(agent)
-    declared = env if isinstance(env, Declaration) else environments.entry(env)
+    declared = environments.entry(env)
     resolved = presets.resolve(declared, name, preset, changes)
     parts = (preset, seed, resolved.train, resolved.hyperparameters)
-    stored = declared.foreign.stored if declared.foreign else None
-    return RunConfig(declared.name, name, *parts, stored)
+    return RunConfig(
+        declared.name,
+        name,
+        *parts,
+        foreign=declared.foreign.stored if declared.foreign else None,
+        maze={"robot": declared.family, **declared.layout.to_json()} if declared.layout else None,
+    )
 
 
 def train(
-    env: EnvLike,
+    env: EnvLike | Declaration,
     *,
     agent: str | AnyAgent = "ris",
     preset: str = "quick",
@@ -114,8 +135,8 @@ def train(
     """Train an agent on an environment and write a run folder.
 
     Args:
-        env: Environment name, what `goal_env` or ``gymnasium.make`` returned, or a class or
-            function that makes it.
+        env: Environment name, what `goal_env`, `maze_env` or ``gymnasium.make`` returned, or a
+            class or function that makes it.
         agent: ``ris``, ``sac`` and so on, ``package.module:NAME``, or the agent itself.
         preset: ``paper``, ``quick``, or the path of a preset file.
         steps: Environment steps; default: the preset's.
@@ -136,8 +157,10 @@ def train(
     folder = RunFolder(Path(out or Path("runs") / run_name(config.env, config.agent, seed)))
     setup = setup_of(config, folder)
     state.check(setup)
-    folder.create(config)
-    return _run(config, folder, setup, progress)
+    folder.prepare()
+    with folder.lock():
+        folder.create(config)
+        return _run_locked(config, folder, setup, progress, None)
 
 
 def resume(
@@ -145,31 +168,37 @@ def resume(
     steps: int | None = None,
     progress: bool = False,
     devices: int | None = None,
+    from_step: int | None = None,
 ) -> Run:
-    """Continue a run from its newest whole checkpoint, bit for bit.
+    """Continue a run from its newest checkpoint, bit for bit.
 
     Args:
         path: The run folder.
         steps: New total of environment steps; default: the run's own.
         progress: Whether to report on standard error.
         devices: New number of accelerators, which changes rounding; default: the run's own.
+        from_step: Step of an older checkpoint to go on from, 0 to start anew; checkpoints after
+            it are renamed and kept.
 
     Raises:
-        ConfigurationError: This is no run folder, its checkpoint is damaged or foreign, or the
-            machine has fewer devices.
+        ConfigurationError: This is no run folder, another process trains it, its checkpoint is
+            damaged, missing or foreign, or the machine has fewer devices.
         NonFiniteError: A loss became NaN or infinite.
     """
     folder = RunFolder(Path(path))
-    config = folder.load_config()
-    train = dataclasses.replace(
-        config.train,
-        steps=config.train.steps if steps is None else int(steps),
-        devices=config.train.devices if devices is None else int(devices),
-    )
-    config = dataclasses.replace(config, train=train)
-    setup = setup_of(config, folder)
-    folder.note_resume(config)
-    return _run(config, folder, setup, progress)
+    folder.load_config()  # a folder that is no run's is refused without a lock in it
+    with folder.lock():
+        config = folder.load_config()
+        train = dataclasses.replace(
+            config.train,
+            steps=config.train.steps if steps is None else int(steps),
+            devices=config.train.devices if devices is None else int(devices),
+        )
+        config = dataclasses.replace(config, train=train)
+        number = _chosen(folder, config, from_step)
+        if number is None:
+            folder.note_resume(config)
+        return _run_locked(config, folder, setup_of(config, folder), progress, number)
 
 
 def load(path: str | Path) -> Policy:
@@ -250,7 +279,7 @@ class RunSinks:
 
     def snapshot(self, training: Training) -> None:
         """Keep the weights of this step, for figures."""
-        policies.keep(self._folder, training)
+        policies.keep(self._folder, self._config, training)
 
     def checkpoint(self, training: Training) -> None:
         """Write a checkpoint and the policy.
@@ -259,33 +288,66 @@ class RunSinks:
             NonFiniteError: A network is not finite; nothing is written then.
         """
         loop.check_finite(training)
-        self._checkpoints.save(training.counters.steps, state.state_dict(training))
+        stored = state.state_dict(training)
+        self._checkpoints.save(training.counters.steps, stored, training.env_spec)
+        self.policy(training)
+
+    def policy(self, training: Training) -> None:
+        """Write the policy."""
         policies.save(self._folder, self._config, training)
 
 
-def _run(config: RunConfig, folder: RunFolder, setup: state.Setup, progress: bool) -> Run:
-    """Restore the newest checkpoint if there is one, then train."""
-    with folder.lock():
-        return _run_locked(config, folder, setup, progress)
+def _chosen(folder: RunFolder, config: RunConfig, from_step: int | None) -> int | None:
+    """Return the step of the whole checkpoint to go on from; None to begin at the beginning.
+
+    Raises:
+        ConfigurationError: That checkpoint is damaged or foreign, or there is none any more.
+    """
+    if from_step == 0:
+        return None
+    number = Checkpoints(folder.checkpoints, folder.owner(config)).choose(from_step)
+    if number is None and complete.had_checkpoint(folder, config):
+        raise ConfigurationError(
+            f"run folder {folder.path}: its checkpoints are gone; to start anew: "
+            f"midway resume {folder.path} --from 0"
+        )
+    return number
 
 
-def _run_locked(config: RunConfig, folder: RunFolder, setup: state.Setup, progress: bool) -> Run:
-    checkpoints = Checkpoints(folder.checkpoints)
-    latest = checkpoints.latest()
-    say: Reporter = reporter(config.train.steps, latest or 0) if progress else Silent()
+def _run_locked(
+    config: RunConfig, folder: RunFolder, setup: state.Setup, progress: bool, number: int | None
+) -> Run:
+    """Restore the checkpoint of a step, if one is given; then train."""
+    folder.remove_unfinished()
+    checkpoints = Checkpoints(folder.checkpoints, folder.owner(config))
+    checkpoints.remove_unfinished()
+    say: Reporter = reporter(config.train.steps, number or 0) if progress else Silent()
     logger = None
     if rule := config.rule_of_success:
         say.message(rule)
     try:
-        training = state.start(setup, say.message if latest is None else None)
-        if latest is not None:
-            training = state.restore(training, checkpoints, latest)
+        training = state.start(setup, say.message if number is None else None)
+        if number is not None:
+            training = state.restore(training, checkpoints, number)
+            folder.note_resume(config)
         steps = training.counters.steps
+        checkpoints.set_aside_after(steps)
         logger = Logger(folder.metrics_file, folder.evaluation_file, folder.path / "events", steps)
         sinks = RunSinks(config, folder, logger, checkpoints, say)
+        if number is not None:
+            _complete(training, sinks, folder)
         return Run(folder.path, loop.run(training, sinks))
     finally:
         say.close()
         if logger is not None:
             logger.close()
         checkpoints.close()
+
+
+def _complete(training: Training, sinks: RunSinks, folder: RunFolder) -> None:
+    """Write what a process that was killed, or somebody, left out beside the checkpoint."""
+    steps = training.counters.steps
+    if complete.policy_step(folder) != steps:
+        sinks.policy(training)
+    if steps >= training.setup.train.steps and not complete.is_evaluated(folder, steps):
+        loop.note_evaluation(training, sinks)

@@ -193,7 +193,7 @@ QUICK: tuple[Rule, ...] = (
     Rule(
         "quick",
         {
-            "steps": 160_000,
+            "steps": 240_000,
             "num_envs": 16,
             "updates_per_step": 0.5,
             "collect_limit": 300,
@@ -362,7 +362,7 @@ def resolve(
     Raises:
         ConfigurationError: A name is unknown, or a value is not allowed.
     """
-    declaration = env if isinstance(env, Declaration) else environments.entry(env)
+    declaration = environments.entry(env)
     config = agents.get(agent).Config
     base, rules = _rules(preset)
     train, hyperparameters = TrainConfig(), config()

@@ -1,12 +1,14 @@
 """CSV files: whole tables, and rows that are appended as a run goes on."""
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
+from midway import files
 from midway.errors import ConfigurationError
 from midway.types import NumPyArray
 
@@ -93,7 +95,6 @@ def _rows(path: Path) -> list[list[str]]:
 
 
 def _replace(path: Path, rows: Sequence[Sequence[object]]) -> None:
-    temporary = path.with_name(path.name + ".new")
-    with temporary.open("w", newline="") as file:
-        csv.writer(file).writerows(rows)
-    temporary.replace(path)
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows(rows)
+    files.write(path, text.getvalue().encode())

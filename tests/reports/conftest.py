@@ -11,7 +11,7 @@ from untrained import save_untrained
 
 from midway import api
 from midway.reports import cache, decoder
-from midway.runs.folder import RunFolder
+from midway.runs.folder import RunFolder, write_json
 
 TINY = {
     "num_envs": 8,
@@ -63,7 +63,7 @@ def copy_run(tmp_path: Path) -> Callable[..., Path]:
     def copy(run: Path, name: str, seed: int = 0, until: int | None = None) -> Path:
         folder = shutil.copytree(run, tmp_path / name, ignore=shutil.ignore_patterns("figures"))
         for file in (folder / "config.json", folder / "policy.json"):
-            file.write_text(json.dumps({**json.loads(file.read_text()), "seed": seed}))
+            write_json(file, {**json.loads(file.read_text()), "seed": seed})
         for table in ("metrics.csv", "evaluation.csv"):
             header, *rows = (folder / table).read_text().splitlines()
             kept = [row for row in rows if until is None or int(row.split(",")[0]) <= until]

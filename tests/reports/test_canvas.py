@@ -1,5 +1,6 @@
 """Every figure has all of its words on its canvas."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from midway.envs.mazes import MAZES
 from midway.reports import compose, curves, maze, style
 from midway.reports.cache import Cache
 from midway.reports.runs import by_environment, read
+from midway.runs.folder import write_json
 
 LONG = "RIS, kl_weight 0.1, learning_rate 0.0001, hard"
 
@@ -31,7 +33,7 @@ def test_mazes(ris_run, sac_run, leap_run, copy_run, tmp_path):
     other = copy_run(ris_run, "s")
     for name in ("config.json", "policy.json"):
         file = other / name
-        file.write_text(file.read_text().replace("point-u", "point-s"))
+        write_json(file, json.loads(file.read_text().replace("point-u", "point-s")))
     assert check([ris_run, sac_run, leap_run, other], tmp_path) == 1 + 11 + 6
 
 

@@ -1,5 +1,6 @@
 """Every figure and the page, from tiny runs."""
 
+import json
 import re
 import shutil
 from html.parser import HTMLParser
@@ -20,6 +21,7 @@ from midway.reports.health import PANELS, with_speed
 from midway.reports.imagined import density, halvings
 from midway.reports.recordings import Recording
 from midway.reports.runs import groups
+from midway.runs.folder import write_json
 
 FIGURES = {"learning-curves", "ris-map", "difficulty", "ris-subgoals", "ris-values", "health"}
 
@@ -127,7 +129,7 @@ def test_several_environments_have_an_overview(ris_run, copy_run, tmp_path):
     other = copy_run(ris_run, "s")
     for name in ("config.json", "policy.json"):
         file = other / name
-        file.write_text(file.read_text().replace("point-u", "point-s"))
+        write_json(file, json.loads(file.read_text().replace("point-u", "point-s")))
     files = report([ris_run, other], tmp_path / "out")
     assert "all-learning-curves.png" in {file.name for file in files}
     assert len(Page(files[0]).images) == 1 + 2 * len(FIGURES)

@@ -8,6 +8,7 @@ import pytest
 from midway.agents import sac
 from midway.reports import report, style
 from midway.reports.runs import agent_labels, groups, read
+from midway.runs.folder import write_json
 
 OUTSIDE = sac.AGENT
 """An agent that is found by the name of this module."""
@@ -19,7 +20,7 @@ def renamed(folder, **values):
     """Change values in the configuration of a run."""
     for name in ("config.json", "policy.json"):
         file = folder / name
-        file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
+        write_json(file, {**json.loads(file.read_text()), **values})
     return folder
 
 

@@ -10,12 +10,13 @@ from midway.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from midway.envs.foreign import Foreign, Settings
+    from midway.envs.registry import Declaration
     from midway.types import JsonObject
 
 
 @dataclasses.dataclass(frozen=True)
 class About:
-    """Only for environments that are not midway's.
+    """What is said of the environment.
 
     Attributes:
         success_distance: A goal is reached within this distance of it.
@@ -24,6 +25,7 @@ class About:
         action_bound: Bounds of actions that have none.
         env_kwargs: Arguments of the environment, as JSON.
         imports: Modules that register environments.
+        maze: File of a maze of your own, for the environments point and ant; or umaze, medium.
     """
 
     success_distance: float | None = None
@@ -32,8 +34,9 @@ class About:
     action_bound: float | None = None
     env_kwargs: str = "{}"
     imports: Annotated[tuple[str, ...], tyro.conf.arg(name="import")] = ()
+    maze: str | None = None
 
-    def env(self, name: str) -> "str | Foreign":
+    def env(self, name: str) -> "str | Foreign | Declaration":
         """Return the environment of this name, with what is said of it; the name if nothing is.
 
         Raises:
@@ -41,9 +44,11 @@ class About:
         """
         if self == NOTHING:
             return name
-        from midway.envs import foreign
-        from midway.envs.registry import ENVIRONMENTS
+        from midway.envs import foreign, layouts
+        from midway.envs.registry import ENVIRONMENTS, own_maze
 
+        if self.maze is not None and self == About(maze=self.maze):
+            return own_maze(name, layouts.read(self.maze))
         if name in ENVIRONMENTS:
             raise ConfigurationError(
                 f"{' '.join(self.options())}: {name} is midway's own, of which nothing need be said"

@@ -5,9 +5,9 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from midway.cli.about import NOTHING, AboutEnv
 from midway.cli.parsing import Count, OptionalCount, parse, plain, settings
@@ -87,7 +87,10 @@ def check(
 
 
 def resume(
-    run: Positional[Path], steps: OptionalCount = None, devices: OptionalCount = None
+    run: Positional[Path],
+    steps: OptionalCount = None,
+    devices: OptionalCount = None,
+    from_: Annotated[OptionalCount, arg(name="from")] = None,
 ) -> None:
     """Continue a run from its newest checkpoint.
 
@@ -95,10 +98,11 @@ def resume(
         run: Run folder.
         steps: New total of environment steps; default: the run's own.
         devices: New number of accelerators; default: the run's own.
+        from_: Step of the checkpoint, 0 to start anew; later ones are renamed and kept.
     """
     from midway import api
 
-    _say_where(api.resume(run, steps=steps, devices=devices, progress=True))
+    _say_where(api.resume(run, steps=steps, devices=devices, progress=True, from_step=from_))
 
 
 def evaluate(
@@ -174,20 +178,22 @@ def sweep(
 
     from midway import api
     from midway.cluster import sweep as sweeps
+    from midway.cluster.jobs import check_settings
 
+    if not (envs and agents and seeds):
+        raise ConfigurationError("nothing to do: give environments, agents and seeds")
     changes = settings(set) | ({} if steps is None else {"steps": steps})
     for env in envs:
         for agent in agents:
-            api.configure(about.env(env), agent, preset, changes=changes)
+            for seed in seeds:
+                api.configure(about.env(env), agent, preset, seed, changes)
     options = ["--preset", preset, *about.options()]
     options += ["--set", *[f"{k}={v}" for k, v in changes.items()]] if changes else []
+    wanted = sweeps.jobs(envs, agents, seeds, options)
+    for job in wanted:
+        check_settings(job, out, preset, changes)
     with Live(console=Console(stderr=True), refresh_per_second=1) as live:
-        final = sweeps.run(
-            sweeps.jobs(envs, agents, seeds, options),
-            out,
-            lambda found: live.update(sweeps.table(found)),
-            ray,
-        )
+        final = sweeps.run(wanted, out, lambda found: live.update(sweeps.table(found)), ray)
     failed = [status.job.name for status in final if status.state != "finished"]
     if failed:
         raise OSError(f"{len(failed)} runs failed ({', '.join(failed)}): see their .log in {out}")

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -11,7 +12,9 @@ import numpy as np
 
 from midway import tables
 from midway.errors import ConfigurationError
+from midway.runs import complete
 from midway.runs.folder import RunFolder, run_name
+from midway.settings import changed, split
 
 State: TypeAlias = Literal["waiting", "running", "finished", "failed"]
 
@@ -47,9 +50,16 @@ class Job:
         """Return the command that starts the run, or continues it where there is one."""
         midway = [sys.executable, "-m", "midway.cli"]
         if RunFolder(folder).config_file.exists():
-            return [*midway, "resume", str(folder)]
+            steps = [] if self.steps is None else ["--steps", str(self.steps)]
+            return [*midway, "resume", str(folder), *steps]
         arguments = ["--agent", self.agent, "--seed", str(self.seed), "--out", str(folder)]
         return [*midway, "train", self.env, *arguments, *self.options]
+
+    @property
+    def steps(self) -> int | None:
+        """Environment steps that its options ask for; None for the preset's."""
+        given = [o.partition("=")[2] for o in self.options if o.startswith("steps=")]
+        return int(given[-1]) if given else None
 
 
 def execute(job: Job, folder: Path, core: int | None = None) -> bool:
@@ -62,8 +72,8 @@ def execute(job: Job, folder: Path, core: int | None = None) -> bool:
     if core is not None:
         command = ["taskset", "-c", str(core), *command]
     with (folder / f"{job.name}.log").open("a") as log:
-        subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False)
-    return finished(job, folder)
+        ended = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False)
+    return ended.returncode == 0 and finished(job, folder)
 
 
 def _wait_until_free(run_folder: RunFolder) -> None:
@@ -75,12 +85,46 @@ def _wait_until_free(run_folder: RunFolder) -> None:
 
 
 def finished(job: Job, folder: Path) -> bool:
-    """Return whether the run has taken all its steps."""
+    """Return whether everything of the run's last step is there."""
+    run_folder = RunFolder(folder / job.name)
+    try:
+        steps = job.steps or run_folder.load_config().train.steps
+    except ConfigurationError:  # the run says what is wrong, if there is one
+        return False
+    return not complete.missing(run_folder, steps)
+
+
+def check_settings(job: Job, folder: Path, preset: str, changes: Mapping[str, object]) -> None:
+    """Check that a run which is there already has the settings that are wanted now.
+
+    Raises:
+        ConfigurationError: It has not, but for the number of its steps.
+    """
     run_folder = RunFolder(folder / job.name)
     if not run_folder.config_file.exists():
-        return False
-    step, _ = last_success(run_folder.evaluation_file)
-    return step is not None and step >= run_folder.load_config().train.steps
+        return
+    config = run_folder.load_config()
+    if config.preset != preset:
+        raise ConfigurationError(
+            f"{run_folder.path} has preset {config.preset}, not {preset}: choose another --out"
+        )
+    known = [config.train, config.hyperparameters]
+    for part, given in zip(known, split(changes, known), strict=True):
+        wanted = changed(part, {k: v for k, v in given.items() if k != "steps"})
+        for name in (name for name in given if name != "steps"):
+            if (there := getattr(part, name)) != (new := getattr(wanted, name)):
+                raise ConfigurationError(
+                    f"{run_folder.path} has {name} {there}, not {new}: choose another --out"
+                )
+
+
+def last_line(folder: Path, job: Job) -> str:
+    """Return the last line that a run has said; nothing if it has said none."""
+    try:
+        lines = (folder / f"{job.name}.log").read_text(errors="replace").split("\n")
+    except OSError:
+        return ""
+    return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
 def last_success(evaluation: Path) -> tuple[int | None, float | None]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from midway.cluster import on_ray
-from midway.cluster.jobs import POLL_SECONDS, Job, State, execute, finished, last_success
+from midway.cluster.jobs import POLL_SECONDS, Job, State, execute, finished, last_line, last_success
 from midway.errors import ConfigurationError
 from midway.runs.folder import RunFolder
 
@@ -31,12 +31,14 @@ class Status:
         state: Whether it waits, runs, is finished or has failed.
         step: Environment steps at its last evaluation.
         success: Its success on the hard task (uniform where there is none), mean actions.
+        reason: The last line of its log, where it has failed.
     """
 
     job: Job
     state: State
     step: int | None
     success: float | None
+    reason: str = ""
 
 
 def jobs(
@@ -88,7 +90,8 @@ def statuses(folder: Path, states: dict[Job, State]) -> list[Status]:
     found = []
     for job, state in dict(states).items():
         step, success = last_success(RunFolder(folder / job.name).evaluation_file)
-        found.append(Status(job, state, step, success))
+        reason = last_line(folder, job) if state == "failed" else ""
+        found.append(Status(job, state, step, success, reason))
     return found
 
 
@@ -118,9 +121,9 @@ def table(found: Sequence[Status]) -> "Table":
     """Return a table of all jobs for a terminal."""
     from rich.table import Table
 
-    view = Table("run", "state", "step", "success")
+    view = Table("run", "state", "step", "success", "why")
     for status in found:
         step = "" if status.step is None else str(status.step)
         success = "" if status.success is None else f"{status.success:.0%}"
-        view.add_row(status.job.name, status.state, step, success)
+        view.add_row(status.job.name, status.state, step, success, status.reason)
     return view

@@ -142,10 +142,11 @@ class AntMazeVectorEnv(MazeVectorEnv):
     An episode has 600 steps of 0.15 s.
 
     Args:
-        maze: ``u``, ``s``, ``pi`` or ``omega``.
+        maze: ``u``, ``s``, ``pi`` or ``omega``, or a maze.
         num_envs: Number of copies.
         task: A task of the maze.
         num_threads: Threads that simulate, 0 for one per core.
+        max_episode_steps: Steps after which an episode is truncated.
 
     Raises:
         ConfigurationError: An unknown task, or no copies.
@@ -158,19 +159,24 @@ class AntMazeVectorEnv(MazeVectorEnv):
     spread = (*SPREAD, *SPREAD_OF_VELOCITIES)
 
     def __init__(
-        self, maze: str, num_envs: int = 1, task: str = "uniform", num_threads: int = 0
+        self,
+        maze: str | Maze,
+        num_envs: int = 1,
+        task: str = "uniform",
+        num_threads: int = 0,
+        max_episode_steps: int = MAX_EPISODE_STEPS,
     ) -> None:
-        shape = MAZES[maze]
+        shape = MAZES[maze] if isinstance(maze, str) else maze
         high = np.full(31, np.inf, np.float32)
         high[3:9] = 1
         super().__init__(
             maze=shape,
             model=ant_model(shape),
-            name=f"ant-{maze}",
+            name=f"ant-{shape.name}",
             num_envs=num_envs,
             task=task,
             observation_box=spaces.Box(-high, high),
-            max_episode_steps=MAX_EPISODE_STEPS,
+            max_episode_steps=max_episode_steps,
             substeps=SUBSTEPS,
             num_threads=num_threads,
         )

@@ -21,6 +21,10 @@ ROUNDING = 1e-5
 """More than float32 rounding can take from a distance in a maze (m)."""
 
 
+LARGEST_IN_SPREADS = 3.0
+"""How many deviations from the middle the far wall lies, at most."""
+
+
 class MazeVectorEnv(SimulationVectorEnv):
     """A robot in a maze whose observation is its full state and whose goals are full states.
 
@@ -73,7 +77,7 @@ class MazeVectorEnv(SimulationVectorEnv):
             state_shape=None,
             task=DistanceTask(groups=((0, 1),), threshold=GOAL_THRESHOLD),
             center=self.center,
-            spread=self.spread,
+            spread=_spread(self.spread, maze),
         )
         super().__init__(
             model=model,
@@ -136,6 +140,12 @@ class MazeVectorEnv(SimulationVectorEnv):
                 f"{role} {points.tolist()}: must be in the maze and {self.body_radius} m from walls"
             )
         return list(points)
+
+
+def _spread(spread: tuple[float, ...], maze: Maze) -> tuple[float, ...]:
+    """Return the deviations of a robot in this maze: those of x and y grow with large ones."""
+    largest = max(maze.arena.half_x, maze.arena.half_y) / LARGEST_IN_SPREADS
+    return (*(max(x, largest) for x in spread[:2]), *spread[2:])
 
 
 def walls_mjcf(maze: Maze, inner: str, outer: str) -> str:

@@ -56,10 +56,11 @@ class PointMazeVectorEnv(MazeVectorEnv):
     of 0.5 s.
 
     Args:
-        maze: ``u``, ``s``, ``pi`` or ``omega``.
+        maze: ``u``, ``s``, ``pi`` or ``omega``, or a maze.
         num_envs: Number of copies.
         task: A task of the maze.
         num_threads: Threads that simulate, 0 for one per core.
+        max_episode_steps: Steps after which an episode is truncated.
 
     Raises:
         ConfigurationError: An unknown task, or no copies.
@@ -69,18 +70,23 @@ class PointMazeVectorEnv(MazeVectorEnv):
     body_radius = BALL_RADIUS
 
     def __init__(
-        self, maze: str, num_envs: int = 1, task: str = "uniform", num_threads: int = 0
+        self,
+        maze: str | Maze,
+        num_envs: int = 1,
+        task: str = "uniform",
+        num_threads: int = 0,
+        max_episode_steps: int = MAX_EPISODE_STEPS,
     ) -> None:
-        shape = MAZES[maze]
+        shape = MAZES[maze] if isinstance(maze, str) else maze
         high = np.array((*shape.arena.high, 2 * MAX_SPEED, 2 * MAX_SPEED), np.float32)
         super().__init__(
             maze=shape,
             model=point_model(shape),
-            name=f"point-{maze}",
+            name=f"point-{shape.name}",
             num_envs=num_envs,
             task=task,
             observation_box=spaces.Box(-high, high),
-            max_episode_steps=MAX_EPISODE_STEPS,
+            max_episode_steps=max_episode_steps,
             substeps=SUBSTEPS,
             num_threads=num_threads,
         )

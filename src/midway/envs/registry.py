@@ -13,6 +13,7 @@ from midway.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from midway.envs.foreign import EnvLike, Foreign
+    from midway.envs.layouts import Layout
     from midway.envs.vector import GoalVectorEnv
 
 
@@ -30,6 +31,7 @@ class Declaration:
         arguments: Arguments of that class besides ``num_envs``, ``task`` and ``num_threads``.
         view: How it is drawn from above, if it is.
         steps: Environment steps of the preset ``quick``.
+        layout: The letters that a maze of one's own was drawn with.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Declaration:
     arguments: dict[str, object] = field(default_factory=dict, hash=False)
     view: View | None = None
     steps: int = 32_000
+    layout: "Layout | None" = None
 
     @property
     def foreign(self) -> "Foreign | None":
@@ -113,6 +116,36 @@ ENVIRONMENTS: dict[str, Declaration] = {
 """Every environment of this package by name, in the order of lists."""
 
 
+def own_maze(robot: str, layout: "Layout") -> Declaration:
+    """Return the declaration of a robot in a maze of one's own.
+
+    Episodes and budget are those of the U-shaped maze, and grow with the way of the hard task.
+
+    Args:
+        robot: ``point`` or ``ant``.
+        layout: The maze.
+
+    Raises:
+        ConfigurationError: There is no such robot.
+    """
+    if robot not in ROBOTS:
+        raise ConfigurationError(f"--maze goes with {' or '.join(ROBOTS)}, not with {robot}")
+    entry_point, limit, upright, title = ROBOTS[robot]
+    maze, longer = layout.maze(), max(1.0, layout.length / WAY_OF_U)
+    return Declaration(
+        name=f"{robot}-{layout.name}",
+        gym_id="",
+        family=robot,
+        description=f"{title} in a maze of one's own",
+        tasks=tuple(maze.cases),
+        entry_point=entry_point,
+        arguments={"maze": maze, "max_episode_steps": 10 * round(limit * longer / 10)},
+        view=MazeView(maze, upright),
+        steps=1_000 * round(ENVIRONMENTS[f"{robot}-u"].steps * longer / 1_000),
+        layout=layout,
+    )
+
+
 def register_ids() -> None:
     """Register every environment with Gymnasium, single and vector."""
     for name, declared in ENVIRONMENTS.items():
@@ -124,12 +157,24 @@ def register_ids() -> None:
         )
 
 
-def entry(env: "EnvLike") -> Declaration:
+ROBOTS = {
+    "point": (POINT, 150, None, "point mass"),
+    "ant": (ANT, 600, (5, 7), "four-legged ant"),
+}
+"""Entry point, steps of an episode in the U-shaped maze, `MazeView.upright`, and title."""
+
+WAY_OF_U = 21.0
+"""Way from start to goal of the hard task of the U-shaped maze (m)."""
+
+
+def entry(env: "EnvLike | Declaration") -> Declaration:
     """Return the declaration of an environment.
 
     Raises:
         ConfigurationError: There is none of this name, or midway cannot use it.
     """
+    if isinstance(env, Declaration):
+        return env
     if isinstance(env, str) and env in ENVIRONMENTS:
         return ENVIRONMENTS[env]
     from midway.envs import foreign, sources
@@ -153,7 +198,7 @@ def entry(env: "EnvLike") -> Declaration:
 
 
 def make_vec(
-    name: "EnvLike", num_envs: int = 1, task: str = "uniform", num_threads: int = 0
+    name: "EnvLike | Declaration", num_envs: int = 1, task: str = "uniform", num_threads: int = 0
 ) -> "GoalVectorEnv":
     """Return environments that are stepped together.
 

@@ -1,7 +1,7 @@
 """The run folder: its configuration, its files, and the versions that made it."""
 
 import dataclasses
-import fcntl
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -10,22 +10,31 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
+from midway import files
 from midway.agents import registry
 from midway.envs import registry as environments
 from midway.envs.foreign import Foreign
+from midway.envs.layouts import Layout
 from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
+from midway.runs import lock
 from midway.settings import changed
+from midway.training.checkpoint import Owner
 from midway.training.config import TrainConfig
 from midway.types import Hyperparameters, JsonObject
 
-FORMAT = 2
-"""Counted up when the files of a run change; format 1 is still understood."""
+FORMAT = 3
+"""Counted up when the files of a run change; formats 1 and 2 are still understood."""
+
+SEALED_SINCE = 3
+"""The first format whose files all have checksums."""
+
+OUTSIDE = ("steps", "devices")
+"""Settings that may change when a run is continued."""
 
 PACKAGES = ("midway", "jax", "equinox", "optax", "mujoco", "gymnasium", "numpy")
 
@@ -43,6 +52,7 @@ class RunConfig:
         hyperparameters: The agent's ``Config``.
         foreign: What was decided about an environment that is not midway's, as JSON; None for
             midway's own, and for one that no other process could make.
+        maze: Robot and letters of a maze of one's own, as JSON.
     """
 
     env: str
@@ -52,6 +62,7 @@ class RunConfig:
     train: TrainConfig
     hyperparameters: Hyperparameters
     foreign: JsonObject | None = None
+    maze: JsonObject | None = None
 
     def declaration(self) -> Declaration:
         """Return the declaration of the environment.
@@ -59,6 +70,8 @@ class RunConfig:
         Raises:
             ConfigurationError: It cannot be found.
         """
+        if self.maze is not None:
+            return environments.own_maze(self.maze["robot"], Layout.from_json(self.maze))
         if self.foreign is None:
             return environments.entry(self.env)
         return environments.entry(Foreign.from_json(self.foreign))
@@ -72,6 +85,13 @@ class RunConfig:
     def to_json(self) -> JsonObject:
         """Return plain values."""
         return dataclasses.asdict(self)
+
+    @property
+    def identity(self) -> str:
+        """What runs that compute the same have in common, however long they are."""
+        values = self.to_json()
+        values["train"] = {k: v for k, v in values["train"].items() if k not in OUTSIDE}
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
     @staticmethod
     def from_json(values: JsonObject) -> "RunConfig":
@@ -91,6 +111,7 @@ class RunConfig:
                 train=changed(TrainConfig(), values["train"]),
                 hyperparameters=changed(agent.Config(), values["hyperparameters"]),
                 foreign=values.get("foreign"),
+                maze=values.get("maze"),
             )
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigurationError(f"configuration not understood: {error}") from error
@@ -123,6 +144,11 @@ class RunFolder:
     def config_file(self) -> Path:
         """``config.json``: every value, versions, commit and command."""
         return self.path / "config.json"
+
+    @property
+    def lock_file(self) -> Path:
+        """``lock``: who trains the run; empty when nobody does."""
+        return self.path / "lock"
 
     @property
     def metrics_file(self) -> Path:
@@ -159,18 +185,37 @@ class RunFolder:
         """Folder of figures."""
         return self.path / "figures"
 
+    def prepare(self) -> None:
+        """Make the folder of a new run, if it is not there.
+
+        Raises:
+            ConfigurationError: There is a run already, other files lie there, or it cannot be made.
+        """
+        try:
+            if self.path.exists() and (not self.path.is_dir() or self._strangers()):
+                hint = "use `midway resume`" if self.config_file.exists() else "choose another"
+                raise ConfigurationError(f"run folder {self.path} is not empty: {hint}")
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigurationError(
+                f"cannot make run folder {self.path}: {error.strerror}"
+            ) from error
+
+    def _strangers(self) -> list[Path]:
+        """Return what a process that was killed before its ``config.json`` does not leave."""
+        left = (self.lock_file.name, self.config_file.name + files.UNFINISHED)
+        return [path for path in self.path.iterdir() if path.name not in left]
+
     def create(self, config: RunConfig) -> None:
         """Make the folder and write ``config.json``.
 
         Raises:
             ConfigurationError: There is a run already, other files lie there, or it cannot be made.
         """
+        self.prepare()
+        values = {**config.to_json(), "run": config.identity, **provenance()}
         try:
-            if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
-                hint = "use `midway resume`" if self.config_file.exists() else "choose another"
-                raise ConfigurationError(f"run folder {self.path} is not empty: {hint}")
-            self.path.mkdir(parents=True, exist_ok=True)
-            write_json(self.config_file, {**config.to_json(), **provenance()})
+            write_json(self.config_file, values)
         except OSError as error:
             raise ConfigurationError(
                 f"cannot make run folder {self.path}: {error.strerror}"
@@ -183,31 +228,35 @@ class RunFolder:
         continued = {**values, **config.to_json(), "resumed": [*values.get("resumed", []), again]}
         write_json(self.config_file, continued)
 
-    @contextmanager
-    def lock(self) -> Iterator[None]:
+    def remove_unfinished(self) -> None:
+        """Remove files that a process which was killed did not finish writing."""
+        for folder in (self.path, self.past_policies):
+            for path in folder.glob(f"*{files.UNFINISHED}"):
+                path.unlink(missing_ok=True)
+
+    def lock(self) -> AbstractContextManager[None]:
         """Keep other processes from training the same run.
 
         Raises:
-            ConfigurationError: Another process trains it.
+            ConfigurationError: Another process trains it; the text names it.
         """
-        with (self.path / "lock").open("w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ConfigurationError(
-                    f"run folder {self.path}: another process trains this run"
-                ) from None
-            yield
+        return lock.hold(self.lock_file, f"run folder {self.path}")
 
     def in_use(self) -> bool:
         """Return whether a process trains this run now."""
-        if not (self.path / "lock").exists():
-            return False
-        try:
-            with self.lock():
-                return False
-        except ConfigurationError:
-            return True
+        return lock.held(self.lock_file)
+
+    def identity(self, config: RunConfig) -> str:
+        """Return the run's identity: what was written at its start, else its configuration's."""
+        if not self.config_file.exists():
+            return config.identity
+        return str(read_json(self.config_file).get("run", config.identity))
+
+    def owner(self, config: RunConfig) -> Owner:
+        """Return whose the checkpoints of the run must be."""
+        written = read_json(self.config_file).get("format", FORMAT)
+        sealed = written >= SEALED_SINCE
+        return Owner(self.identity(config), config.env, config.agent, sealed)
 
     def load_config(self) -> RunConfig:
         """Return the configuration of the run.
@@ -216,9 +265,11 @@ class RunFolder:
             ConfigurationError: This is no run folder, or not one of this version.
         """
         values = read_json(self.config_file)
-        if values.get("format") not in (1, FORMAT):
-            raise ConfigurationError(f"{self.config_file}: not a run of this version of midway")
-        return RunConfig.from_json(values)
+        check_format(values, self.config_file)
+        try:
+            return RunConfig.from_json(values)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{self.config_file}: {error}") from error
 
 
 def provenance() -> JsonObject:
@@ -250,17 +301,19 @@ def _commit() -> str | None:
 
 
 def write_json(path: Path, values: JsonObject) -> None:
-    """Write a file that is there whole or not at all."""
-    temporary = path.with_name(path.name + ".new")
-    temporary.write_text(json.dumps(values, indent=2) + "\n")
-    temporary.replace(path)
+    """Write values with their checksum, in a file that is there whole or not at all.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    files.write(path, (json.dumps(files.sealed(values), indent=2) + "\n").encode())
 
 
 def read_json(path: Path) -> JsonObject:
     """Return the object in a JSON file.
 
     Raises:
-        ConfigurationError: The file cannot be read or holds no JSON object.
+        ConfigurationError: The file cannot be read, holds no JSON object, or was changed.
     """
     try:
         values = json.loads(path.read_text())
@@ -268,8 +321,25 @@ def read_json(path: Path) -> JsonObject:
         raise ConfigurationError(
             f"{path.parent} is no readable run folder: {path.name}: {error.strerror}"
         ) from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, absurd numbers or depth
         raise ConfigurationError(f"{path} is damaged: {error}") from error
     if not isinstance(values, dict):
         raise ConfigurationError(f"{path} is damaged: it holds no JSON object")
+    files.check_seal(values, path)
     return values
+
+
+def check_format(values: JsonObject, path: Path) -> None:
+    """Check that a file is of a format that is understood, and has a checksum where it must.
+
+    Raises:
+        ConfigurationError: It is not, or has none.
+    """
+    written = values.get("format")
+    if type(written) is not int or not 1 <= written <= FORMAT:
+        raise ConfigurationError(
+            f"{path}: not a run of this version of midway: format {written!r}, "
+            f"expected 1 to {FORMAT}"
+        )
+    if written >= SEALED_SINCE and files.SEAL not in values:
+        raise ConfigurationError(f"{path} is damaged: expected a checksum named {files.SEAL}")

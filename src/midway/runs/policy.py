@@ -15,14 +15,22 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from midway.agent import AgentState, AnyAgent, Encoder, Inputs, Memory, SubgoalDistribution
 from midway.agents import registry
-from midway.runs.folder import FORMAT, RunConfig, RunFolder, read_json, write_json
+from midway.errors import ConfigurationError
+from midway.runs.folder import (
+    FORMAT,
+    RunConfig,
+    RunFolder,
+    check_format,
+    read_json,
+    write_json,
+)
 from midway.training import acting, freeze
 from midway.training.acting import Seen
 from midway.training.arrays import array_names, load_arrays, networks_of, save_arrays
 from midway.training.evaluate import ActionKind
 from midway.training.state import FROZEN, Training
 from midway.training.step import create_state
-from midway.types import AnyArray, EnvSpec, NumPyArray
+from midway.types import AnyArray, EnvSpec, JsonObject, NumPyArray
 
 Found = TypeVar("Found")
 
@@ -146,26 +154,28 @@ def _act_on(
 
 def save(folder: RunFolder, config: RunConfig, training: Training) -> None:
     """Write ``policy.safetensors`` and ``policy.json``, each whole or not at all."""
-    _save_weights(folder.policy_weights, training)
+    _save_weights(folder.policy_weights, folder.identity(config), training)
     description = {
         "format": FORMAT,
         "step": training.counters.steps,
+        "run": folder.identity(config),
         **config.to_json(),
         "spec": training.env_spec.to_json(),
     }
     write_json(folder.policy_config, description)
 
 
-def keep(folder: RunFolder, training: Training) -> None:
+def keep(folder: RunFolder, config: RunConfig, training: Training) -> None:
     """Write a snapshot of the weights to ``policies/step-N.safetensors``."""
     folder.past_policies.mkdir(exist_ok=True)
     name = f"step-{training.counters.steps}.safetensors"
-    _save_weights(folder.past_policies / name, training)
+    _save_weights(folder.past_policies / name, folder.identity(config), training)
 
 
-def _save_weights(path: Path, training: Training) -> None:
+def _save_weights(path: Path, run: str, training: Training) -> None:
     networks = networks_of(training.state, training.setup.agent.networks)
-    save_arrays(path, networks | _frozen(training.encoder))
+    about = {"run": run, "step": training.counters.steps}
+    save_arrays(path, networks | _frozen(training.encoder), about)
 
 
 def _frozen(encoder: Encoder | None) -> dict[str, PyTree]:
@@ -183,9 +193,7 @@ def load(folder: RunFolder, weights: Path | None = None) -> Policy:
     Raises:
         ConfigurationError: The folder holds no policy, or a damaged one.
     """
-    description = read_json(folder.policy_config)
-    config = RunConfig.from_json(description)
-    spec = EnvSpec.from_json({"task": None, **description.get("spec", {})})
+    description, config, spec = _described(folder)
     agent = registry.get(config.agent)
     state = create_state(agent, config.hyperparameters, spec, jax.random.key(0))
     path, encoder = weights or folder.policy_weights, None
@@ -194,9 +202,34 @@ def load(folder: RunFolder, weights: Path | None = None) -> Policy:
         features = freeze.encoded_spec(spec, encoder)
         state = create_state(agent, config.hyperparameters, features, jax.random.key(0))
     parts = networks_of(state, agent.networks) | _frozen(encoder)
-    arrays = load_arrays(path, parts)
+    run = description.get("run")
+    arrays = load_arrays(path, parts, {"run": run} if run else None)
     if encoder is not None:
         encoder = eqx.combine(arrays.pop(FROZEN), encoder)
     loaded = {name: eqx.combine(arrays[name], getattr(state, name)) for name in arrays}
     state = dataclasses.replace(state, **loaded)
     return Policy(agent, state, config, spec, description.get("step"), encoder)
+
+
+def _described(folder: RunFolder) -> tuple[JsonObject, RunConfig, EnvSpec]:
+    """Return what ``policy.json`` holds, and the run and environment that it describes.
+
+    Raises:
+        ConfigurationError: It is missing, damaged, or of another run than the folder's.
+    """
+    path = folder.policy_config
+    description = read_json(path)
+    check_format(description, path)
+    try:
+        config = RunConfig.from_json(description)
+        spec = EnvSpec.from_json({"task": None, **description.get("spec", {})})
+    except (ConfigurationError, TypeError) as error:
+        raise ConfigurationError(f"{path}: {error}") from error
+    if folder.config_file.exists() and "run" in description:
+        expected = folder.identity(folder.load_config())
+        if description["run"] != expected:
+            raise ConfigurationError(
+                f"{path} is of another run: {description['run']!r} in {config.env!r}, "
+                f"expected {expected!r}"
+            )
+    return description, config, spec

@@ -1,5 +1,11 @@
-"""Whole states on disk: written completely or not at all."""
+"""Whole states on disk: written completely or not at all, and checked before they are used."""
 
+import json
+import logging
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -7,8 +13,9 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from midway import files
 from midway.errors import ConfigurationError
-from midway.types import AnyArray, NumPyArray
+from midway.types import AnyArray, EnvSpec, JsonObject, NumPyArray
 
 Stored: TypeAlias = dict[str, Any]
 """Dictionaries of arrays, within each other."""
@@ -16,45 +23,181 @@ Stored: TypeAlias = dict[str, Any]
 KEPT = 2
 """Checkpoints kept: the newest, and the one before it should the newest be damaged."""
 
+FORMAT = 1
+"""Counted up when the files of a checkpoint change."""
+
+ARRAYS = "default"
+MANIFEST = "manifest.json"
+SET_ASIDE = ".set-aside"
+
+
+@dataclass(frozen=True)
+class Owner:
+    """The run that checkpoints must be of.
+
+    Attributes:
+        run: Its identity.
+        env: Environment name.
+        agent: Agent name.
+        sealed: Whether each checkpoint must have checksums: those of earlier versions have none.
+    """
+
+    run: str
+    env: str
+    agent: str
+    sealed: bool = True
+
 
 class Checkpoints:
     """Checkpoints of one run, by environment step.
 
-    Saving waits until everything is on disk: the arrays are donated to the next update, and a
-    second copy of a replay of images would not fit beside the first.
+    A checkpoint is written under another name, its checksums after its arrays, and then renamed:
+    what is called by its step is whole. Saving waits until everything is on disk: the arrays are
+    donated to the next update, and a second copy of a replay of images would not fit beside the
+    first.
+
+    Args:
+        folder: Their folder.
+        owner: The run that they must be of; None to take any.
     """
 
-    def __init__(self, folder: Path) -> None:
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=KEPT, enable_async_checkpointing=False, create=True
-        )
-        self._manager = ocp.CheckpointManager(
-            folder.absolute(), options=options, item_handlers=ocp.StandardCheckpointHandler()
-        )
+    def __init__(self, folder: Path, owner: Owner | None = None) -> None:
+        self._folder = folder.absolute()
+        self._owner = owner
+        self._checkpointer = ocp.Checkpointer(ocp.StandardCheckpointHandler())
 
-    def save(self, step: int, state: Stored) -> None:
+    def steps(self) -> list[int]:
+        """Return the steps of all checkpoints, the newest last."""
+        return steps_in(self._folder)
+
+    def latest(self) -> int | None:
+        """Return the step of the newest checkpoint."""
+        return max(self.steps(), default=None)
+
+    # --- writing ----------------------------------------------------------------------------------
+
+    def save(self, step: int, state: Stored, spec: EnvSpec | None = None) -> None:
         """Write a state, a nested dictionary of arrays, unless that of this step is there.
+
+        Args:
+            step: Its environment step.
+            state: The state.
+            spec: The environment that it belongs to.
 
         Raises:
             OSError: It cannot be written; the checkpoints before it are as they were.
         """
-        if step == self.latest():
+        if step in self.steps():
             return
+        unfinished = self._folder / f"{step}{files.UNFINISHED}"
         try:
-            self._manager.save(step, args=ocp.args.StandardSave(state), force=True)
-            self._manager.wait_until_finished()
+            self.remove_unfinished()
+            self._folder.mkdir(exist_ok=True)
+            self._checkpointer.save(unfinished / ARRAYS, args=ocp.args.StandardSave(state))
+            self._seal(unfinished, step, spec)
+            unfinished.rename(self._folder / str(step))
+            for old in self.steps()[:-KEPT]:
+                _remove(self._folder / str(old))
         except (OSError, ValueError) as error:
-            reason = str(error).splitlines()[0]
+            shutil.rmtree(unfinished, ignore_errors=True)
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise OSError(f"checkpoint of step {step} cannot be written: {reason}") from error
 
-    def latest(self) -> int | None:
-        """Return the step of the newest whole checkpoint."""
-        step: int | None = self._manager.latest_step()
-        return step
+    def remove_unfinished(self) -> None:
+        """Remove what a process that was killed did not finish writing or removing."""
+        if self._folder.is_dir():
+            for path in self._folder.glob(f"*{files.UNFINISHED}"):
+                shutil.rmtree(path, ignore_errors=True)
+
+    def set_aside_after(self, step: int) -> None:
+        """Rename the checkpoints after a step, which the run is about to reach anew."""
+        for later in (found for found in self.steps() if found > step):
+            name = self._folder / f"{later}{SET_ASIDE}"
+            number = 1
+            while name.exists():
+                number += 1
+                name = name.with_name(f"{later}{SET_ASIDE}-{number}")
+            (self._folder / str(later)).rename(name)
+
+    def _seal(self, folder: Path, step: int, spec: EnvSpec | None) -> None:
+        manifest = {
+            "format": FORMAT,
+            "step": step,
+            "owner": asdict(self._owner) if self._owner else None,
+            "spec": spec.to_json() if spec else None,
+            "files": {name: files.checksum(folder / name) for name in _names(folder)},
+        }
+        files.write(folder / MANIFEST, json.dumps(files.sealed(manifest), indent=1).encode())
+
+    # --- reading ----------------------------------------------------------------------------------
+
+    def choose(self, step: int | None = None) -> int | None:
+        """Return the step to go on from, whose checkpoint is whole; None if there is none at all.
+
+        Args:
+            step: The step that is wanted; None for the newest.
+
+        Raises:
+            ConfigurationError: It is damaged, missing or of another run; the text names the
+                newest whole one before it.
+        """
+        wanted = self.latest() if step is None else step
+        if wanted is None:
+            return None
+        try:
+            self.verify(wanted)
+        except ConfigurationError as error:
+            whole = next((s for s in reversed(self.steps()) if s < wanted and self._whole(s)), None)
+            offer = (
+                "no older one is whole, to start anew"
+                if whole is None
+                else f"that of step {whole} is whole, to go on from it"
+            )
+            command = f"midway resume {self._folder.parent} --from {whole or 0}"
+            raise ConfigurationError(f"{error}; {offer}: {command}") from None
+        return wanted
+
+    def verify(self, step: int) -> None:
+        """Check every file of a checkpoint, and whose it is.
+
+        Raises:
+            ConfigurationError: A file is missing, added or changed, or it is of another run.
+        """
+        folder, name = self._folder / str(step), f"checkpoint of step {step}"
+        if not folder.is_dir():
+            raise ConfigurationError(f"{name} is not there: {self._folder / str(step)}")
+        manifest = self._manifest(step)
+        if manifest is None:
+            return
+        try:
+            if (manifest["format"], manifest["step"]) != (FORMAT, step):
+                raise ConfigurationError(
+                    f"{name} says it is of step {manifest['step']}, format {manifest['format']}; "
+                    f"expected step {step}, format {FORMAT}"
+                )
+            self._check_owner(name, manifest["owner"])
+            _check_files(name, folder, manifest["files"])
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ConfigurationError(f"{name}: {MANIFEST} not understood: {error}") from error
+
+    def check_spec(self, step: int, spec: EnvSpec) -> None:
+        """Check that the environment is described as it was when a checkpoint was written.
+
+        Raises:
+            ConfigurationError: It is not; the text names the first difference.
+        """
+        stored = (self._manifest(step) or {}).get("spec") or {}
+        now = json.loads(json.dumps(spec.to_json()))
+        for name in stored.keys() & now.keys():
+            if stored[name] != now[name]:
+                raise ConfigurationError(
+                    f"checkpoint of step {step} is of another environment: {name} "
+                    f"{stored[name]}, expected {now[name]}"
+                )
 
     def parts(self, step: int) -> tuple[str, ...]:
         """Return the names of what a checkpoint holds; nothing if it cannot be read."""
-        return tuple(self._manager.item_metadata(step) or {})
+        return tuple(self._metadata(step))
 
     def restore(self, step: int, like: Stored) -> Stored:
         """Return the state of a step, with the structure, shapes and dtypes of ``like``.
@@ -62,27 +205,128 @@ class Checkpoints:
         Raises:
             ConfigurationError: The checkpoint is damaged or belongs to another run.
         """
+        self.verify(step)
         try:
             target = jax.tree.map(_abstract, self._stored(step, like))
-            restored: Stored = self._manager.restore(step, args=ocp.args.StandardRestore(target))
+            with _quiet():
+                restored: Stored = self._checkpointer.restore(
+                    self._folder / str(step) / ARRAYS, args=ocp.args.StandardRestore(target)
+                )
             return restored
-        except (ValueError, KeyError, FileNotFoundError) as error:
+        except (ValueError, KeyError, OSError) as error:
             reason = str(error).splitlines()[0]
             raise ConfigurationError(
                 f"checkpoint of step {step} cannot be read: {reason}"
             ) from error
 
+    def close(self) -> None:
+        """Free what reading and writing hold."""
+        self._checkpointer.close()
+
+    def _whole(self, step: int) -> bool:
+        try:
+            self.verify(step)
+        except ConfigurationError:
+            return False
+        return True
+
+    def _manifest(self, step: int) -> JsonObject | None:
+        """Return what a checkpoint says of itself; None for one of an earlier version."""
+        path = self._folder / str(step) / MANIFEST
+        if not path.exists() and not (self._owner and self._owner.sealed):
+            return None
+        try:
+            manifest = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise ConfigurationError(
+                f"checkpoint of step {step} is damaged: {MANIFEST}: {reason}"
+            ) from error
+        if not isinstance(manifest, dict) or files.SEAL not in manifest:
+            raise ConfigurationError(
+                f"checkpoint of step {step} is damaged: {MANIFEST} has no checksum"
+            )
+        files.check_seal(manifest, f"checkpoint of step {step}: {MANIFEST}")
+        found: JsonObject = manifest
+        return found
+
+    def _check_owner(self, name: str, stored: JsonObject | None) -> None:
+        expected = asdict(self._owner) if self._owner else {}
+        for what in ("env", "agent", "run"):
+            if expected and (found := (stored or {}).get(what)) != expected[what]:
+                raise ConfigurationError(
+                    f"{name} is of another run: {what} {found!r}, expected {expected[what]!r}"
+                )
+
+    def _metadata(self, step: int) -> Stored:
+        try:
+            with _quiet():
+                found = self._checkpointer.metadata(self._folder / str(step) / ARRAYS)
+        except (ValueError, KeyError, OSError):
+            return {}
+        return dict(found.item_metadata or {})
+
     def _stored(self, step: int, like: Stored) -> Stored:
         """Return ``like`` without the sums that checkpoints of earlier versions do not have."""
-        stored = self._manager.item_metadata(step) or {}
-        if "logged" in stored.get("collector", {}):
+        if "logged" in self._metadata(step).get("collector", {}):
             return like
         kept = {name: part for name, part in like["collector"].items() if name != "logged"}
         return {**like, "collector": kept}
 
-    def close(self) -> None:
-        """Free what the manager holds."""
-        self._manager.close()
+
+def steps_in(folder: Path) -> list[int]:
+    """Return the steps of the checkpoints in a folder, the newest last."""
+    if not folder.is_dir():
+        return []
+    return sorted(int(path.name) for path in folder.iterdir() if path.name.isdecimal())
+
+
+def _names(folder: Path) -> list[str]:
+    """Return the files of a checkpoint but its manifest."""
+    found = (path for path in folder.rglob("*") if not path.is_dir())
+    names = (path.relative_to(folder).as_posix() for path in found)
+    return sorted(name for name in names if name != MANIFEST)
+
+
+def _check_files(name: str, folder: Path, expected: dict[str, str]) -> None:
+    """Check names and checksums of the files of a checkpoint.
+
+    Raises:
+        ConfigurationError: One is missing, added or changed; the text names the first.
+    """
+    there = set(_names(folder))
+    for file, digest in expected.items():
+        if file not in there:
+            raise ConfigurationError(f"{name} is damaged: {file} is missing")
+        try:
+            found = files.checksum(folder / file)
+        except OSError as error:
+            raise ConfigurationError(f"{name} is damaged: {file}: {error.strerror}") from error
+        if found != digest:
+            raise ConfigurationError(
+                f"{name} is damaged: SHA-256 of {file} {files.short(found)}, "
+                f"expected {files.short(digest)}"
+            )
+    if more := sorted(there - expected.keys()):
+        raise ConfigurationError(f"{name} is damaged: {more[0]} does not belong to it")
+
+
+def _remove(folder: Path) -> None:
+    """Remove a checkpoint under another name, so that no half of one is called by its step."""
+    going = folder.rename(folder.with_name(f"{folder.name}{files.UNFINISHED}"))
+    shutil.rmtree(going)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Orbax from warning of metadata that earlier versions did not write."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _abstract(leaf: AnyArray) -> jax.ShapeDtypeStruct | NumPyArray:

@@ -176,7 +176,7 @@ def run(training: Training, sinks: Sinks) -> bool:
             if every(train.log_every):
                 _log(training, sinks, success)
             if every(train.evaluate_every):
-                success = _evaluate(training, sinks)
+                success = note_evaluation(training, sinks)
             if every(max(1, train.steps // SNAPSHOTS)):
                 sinks.snapshot(training)
             tick()
@@ -211,7 +211,7 @@ def _log(training: Training, sinks: Sinks, success: dict[str, float]) -> None:
     sinks.progress(counters.steps, {"steps/s": speed, **success})
 
 
-def _evaluate(training: Training, sinks: Sinks) -> dict[str, float]:
+def note_evaluation(training: Training, sinks: Sinks) -> dict[str, float]:
     """Evaluate, write a row for each task and kind of action, and return success by task."""
     counters, success = training.counters, {}
     for result in evaluate(training):

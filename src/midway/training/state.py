@@ -268,6 +268,7 @@ def restore(training: Training, checkpoints: Checkpoints, number: int) -> Traini
     Raises:
         ConfigurationError: The checkpoint is damaged or belongs to another run.
     """
+    checkpoints.check_spec(number, training.env_spec)
     freezing = training.setup.agent.freezing
     if FROZEN in checkpoints.parts(number) and training.encoder is None and freezing:
         encoder, env = freezing.encoder(training.state), training.collector.env
