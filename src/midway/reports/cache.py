@@ -183,11 +183,11 @@ class Study:
 
     def chain(self) -> Table:
         """Return the positions of the subgoal chain of the hard task."""
-        return self._way("chain", partial(recordings.chain, self.policy, depth=CHAIN_DEPTH))
+        return self._way("chain", partial(recordings.chain, depth=CHAIN_DEPTH))
 
     def plan(self) -> Table:
         """Return the positions of the subgoals that are planned for the hard task."""
-        return self._way("plan", partial(recordings.first_plan, self.policy))
+        return self._way("plan", recordings.first_plan)
 
     def ends(self) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
         """Return the positions of start and goal in the middle of the hard task's boxes (m)."""
@@ -238,7 +238,8 @@ class Study:
         """Return the positions of subgoals between start and goal of the hard task."""
 
         def compute() -> Table:
-            x, y = find(*self._hard_pair())[:, self._maze_view.position].T.astype(np.float64)
+            way = find(self.policy, *self._hard_pair())[:, self._maze_view.position]
+            x, y = way.T.astype(np.float64)
             return {"x": x, "y": y}
 
         return self._table(name, compute)
