@@ -9,8 +9,8 @@ QUICK := tests/test_architecture.py tests/test_dependencies.py tests/test_functi
 	tests/networks/test_critics.py tests/networks/test_mlp.py tests/networks/test_policies.py \
 	tests/replay/test_replay_properties.py tests/replay/test_replay_uniform.py
 
-# Two workers share the files, so that a file trains its small runs once.
-PYTEST := $(BIN)/pytest --numprocesses auto --dist loadfile
+# Two workers share the files, so that a file trains its small runs once; conftest.py sorts them.
+PYTEST := $(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 COVERAGE := --cov=midway
 
 .PHONY: train check test test-all test-lowest lint format clean

@@ -15,9 +15,9 @@ from midway.training.compilation import give_back_memory, use_compilation_cache
 
 # LLVM's optimisations are most of the time of compiling, and no program of a test is large enough
 # to win it back. The processes that tests start compile alike: their results are compared.
-FLAG = "--xla_backend_optimization_level=0"
-if FLAG not in os.environ.get("XLA_FLAGS", ""):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAG}".strip()
+LEVEL = "--xla_backend_optimization_level"
+if LEVEL not in os.environ.get("XLA_FLAGS", ""):
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {LEVEL}=0".strip()
 
 # No example is timed: a test's time limit (pyproject.toml) is the only clock.
 hypothesis.settings.register_profile(
@@ -30,6 +30,21 @@ MAY_SKIP = "MIDWAY_TESTS_MAY_SKIP"
 
 MUCH = 1_000_000_000
 """Bytes in memory that a worker lets go of its compiled programs at, before the next test."""
+
+LONGEST = (
+    "training/test_resume.py",
+    "reports/test_report.py",
+    "training/test_from_images.py",
+    "envs/test_foreign.py",
+    "agents/test_leap.py",
+    "cluster/test_ray.py",
+    "test_own_agent.py",
+    "training/test_freeze.py",
+    "test_cli.py",
+    "training/test_devices.py",
+    "reports/test_browser.py",
+)
+"""Files that are begun before all others, so that no worker waits for them at the end."""
 
 peaks = pytest.StashKey[list[int]]()
 
@@ -67,6 +82,12 @@ def let_go() -> None:
     jax.clear_caches()
     gc.collect()
     give_back_memory()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Sort the files; workers take them in this order with ``--no-loadscope-reorder``."""
+    place = {Path(__file__).parent / name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path, len(LONGEST)))
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -45,10 +45,9 @@ SIZES = [(1, 12), (3, 24)]
 BATCH = 2048
 
 # Compiled once for all tests, and quickly: these tests are about results.
-QUICKLY = {"xla_backend_optimization_level": 0}
-begin = jax.jit(buffer.begin, compiler_options=QUICKLY)
-add = jax.jit(buffer.add, compiler_options=QUICKLY)
-_sample = jax.jit(buffer.sample, static_argnums=(1, 2, 3, 5), compiler_options=QUICKLY)
+begin = jax.jit(buffer.begin)
+add = jax.jit(buffer.add)
+_sample = jax.jit(buffer.sample, static_argnums=(1, 2, 3, 5))
 
 
 def sample(replay, spec, mix, seed, wanted=None):

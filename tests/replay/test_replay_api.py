@@ -8,7 +8,6 @@ from replay_reference import (
     BATCH,
     IMAGE,
     PAIR,
-    QUICKLY,
     SIZES,
     SPECS,
     VECTOR,
@@ -166,7 +165,7 @@ def test_one_compilation():
             traces[name] += 1
             return function(*arguments)
 
-        return jax.jit(call, compiler_options=QUICKLY)
+        return jax.jit(call)
 
     compiled_begin, compiled_add = counted("begin", buffer.begin), counted("add", buffer.add)
     compiled_sample = counted(
