@@ -42,6 +42,7 @@ EXTRAS = {
     for name, lines in PYPROJECT["project"]["optional-dependencies"].items()
 }
 DEV, ROBOTICS = EXTRAS.pop("dev"), EXTRAS.pop("robotics")
+assert EXTRAS["data"].pop("h5py")  # Minari reads its files by it
 OPTIONAL = {name for extra in EXTRAS.values() for name in extra}
 
 
