@@ -1,5 +1,6 @@
 """LEAP: the planner on values in closed form, segments and time, both stages, images and pairs."""
 
+import functools
 import itertools
 from dataclasses import replace
 
@@ -41,6 +42,16 @@ def equal(first, second) -> bool:
     return all(np.array_equal(a, b) for a, b in pairs)
 
 
+# Made once for each configuration and specification, in one program instead of one an operation.
+compiled_create = eqx.filter_jit(leap.create)
+pretrain = eqx.filter_jit(leap.pretrain)
+
+
+@functools.cache
+def create(config: leap.Config, spec: EnvSpec) -> leap.State:
+    return compiled_create(config, spec, KEY)
+
+
 def with_plain_latents(state: leap.State) -> leap.State:
     """Return the state with an autoencoder whose latent numbers are the state itself."""
     vae = StateVAE(2, 2, (), key=KEY)
@@ -50,15 +61,15 @@ def with_plain_latents(state: leap.State) -> leap.State:
 
 
 def planner(config: leap.Config) -> leap.State:
-    return with_plain_latents(leap.create(config, SPECS["states"], KEY))
+    return with_plain_latents(create(config, SPECS["states"]))
 
 
 def on_features(config):
     """Return LEAP as it acts on images: made for the latents of its frozen autoencoder."""
-    pictured = leap.create(config, SPECS["images"], KEY)
+    pictured = create(config, SPECS["images"])
     encoder = leap.AGENT.freezing.encoder(pictured)
     spec = freeze.encoded_spec(SPECS["images"], encoder)
-    fresh = leap.create(config, spec, KEY)
+    fresh = create(config, spec)
     return freeze.keep(leap.AGENT, fresh, pictured), spec, encoder
 
 
@@ -66,7 +77,7 @@ def made(config, kind):
     """Return LEAP as it acts and learns on a kind of observations, and what it was made for."""
     if kind == "images":
         return on_features(config)[:2]
-    return leap.create(config, SPECS[kind], KEY), SPECS[kind]
+    return create(config, SPECS[kind]), SPECS[kind]
 
 
 # --- the planner ----------------------------------------------------------------------------------
@@ -212,7 +223,7 @@ def test_episodes_at_different_times_plan_on_their_own(monkeypatch):
 
 
 def test_exploration_is_the_tdm_without_a_plan():
-    state = leap.create(SMALL, SPECS["states"], KEY)
+    state = create(SMALL, SPECS["states"])
     memory = leap.begin(SMALL, SPECS["states"], 4)
     start, goal = jnp.ones((4, 2)), jnp.zeros((4, 2))
     actions, after = leap.act_on(state, memory, start, goal, KEY, True)
@@ -239,7 +250,7 @@ def test_actions_are_in_bounds_and_repeatable(kind):
 
 
 def test_subgoals_have_both_roles():
-    state = leap.create(SMALL, SPECS["pairs"], KEY)
+    state = create(SMALL, SPECS["pairs"])
     latent = jax.random.normal(KEY, (4, 2))
     subgoal = leap.subgoals_of(state, latent)
     both = state.vae.decode(latent)
@@ -306,13 +317,12 @@ def test_updates_are_those_of_the_tdm_and_leave_the_autoencoder(kind):
 def test_pretraining_teaches_the_autoencoder_alone():
     spec = SPECS["states"]
     config = replace(SMALL, vae_kl_weight=1e-3, vae_learning_rate=3e-3, vae_updates=150)
-    state = leap.create(config, spec, KEY)
+    state = create(config, spec)
     positions = jax.random.uniform(KEY, (2_000, 2), minval=-6.0, maxval=6.0)
     states = Subgoal(positions, positions)
-    one_round = eqx.filter_jit(leap.pretrain)
     distances, after = [], state
     for number in range(8):
-        after, metrics = one_round(after, states, jax.random.key(number))
+        after, metrics = pretrain(after, states, jax.random.key(number))
         distances.append(float(metrics["vae/held_out_distance"]))
     assert distances[-1] < 0.4 < distances[0]
     expected = metrics["vae/error"] + 1e-3 * metrics["vae/kl"]
@@ -324,9 +334,9 @@ def test_pretraining_teaches_the_autoencoder_alone():
 
 def test_pretraining_reads_both_roles_of_a_state():
     spec = SPECS["pairs"]
-    state = leap.create(replace(SMALL, vae_updates=2), spec, KEY)
+    state = create(replace(SMALL, vae_updates=2), spec)
     states = Subgoal(jax.random.normal(KEY, (100, 5)), jax.random.normal(KEY, (100, 2)))
-    after, _ = leap.pretrain(state, states, KEY)
+    after, _ = pretrain(state, states, KEY)
     assert after.vae.center.shape == (7,)
 
 
@@ -337,7 +347,7 @@ def test_settings_of_pretraining():
 
 
 def test_the_value_of_leap_is_that_of_its_tdm_at_the_whole_horizon():
-    state = leap.create(SMALL, SPECS["pairs"], KEY)
+    state = create(SMALL, SPECS["pairs"])
     observation, goal = jax.random.normal(KEY, (6, 5)), jax.random.normal(KEY, (6, 2))
     found = leap.AGENT.value.estimate(state, observation, goal)
     whole = jnp.full((6, 1), float(SMALL.max_steps_left))
@@ -345,7 +355,7 @@ def test_the_value_of_leap_is_that_of_its_tdm_at_the_whole_horizon():
 
 
 def test_reconstructions_are_what_the_autoencoder_keeps_of_both_roles():
-    state = leap.create(SMALL, SPECS["pairs"], KEY)
+    state = create(SMALL, SPECS["pairs"])
     states = Subgoal(jax.random.normal(KEY, (9, 5)), jax.random.normal(KEY, (9, 2)))
     both = jnp.concatenate(states, axis=1)
     expected = state.vae.decode(state.vae.encode(both).mean)
@@ -355,7 +365,7 @@ def test_reconstructions_are_what_the_autoencoder_keeps_of_both_roles():
 def test_plans_are_told_as_achieved_goals_in_the_units_of_the_environment():
     spec = replace(SPECS["pairs"], origin=(1.0, 2.0, 0.0, 0.0, 0.0, 3.0, 4.0), unit=0.5)
     spec = replace(spec, observation_shape=(7,), goal_shape=(7,), goal_is_observation=True)
-    state = leap.create(SMALL, spec, KEY)
+    state = create(SMALL, spec)
     memory = leap.begin(SMALL, spec, 2)._replace(latents=jax.random.normal(KEY, (2, 3, 2)))
     plans = leap.AGENT.memory.plan(state, memory)
     assert plans.shape == (2, 3, 7)
