@@ -18,7 +18,7 @@ from midway.training.checkpoint import Checkpoints, Stored
 from midway.training.collect import Collector
 from midway.training.config import TrainConfig
 from midway.training.devices import Devices
-from midway.training.pretrain import MakeEnv, Say
+from midway.training.pretrain import Check, MakeEnv, Say
 from midway.training.step import Arrays, Program
 from midway.types import EnvSpec, Hyperparameters, Metrics, VectorGoalEnv
 
@@ -132,19 +132,20 @@ def check(setup: Setup) -> None:
     eqx.filter_eval_shape(setup.agent.create, setup.hyperparameters, spec, key)
 
 
-def start(setup: Setup, say: Say | None = None) -> Training:
+def start(setup: Setup, say: Say | None = None, check: Check = lambda: None) -> Training:
     """Return a run before its first step.
 
     Args:
         setup: What it is made of.
         say: Is told of pre-training; None to leave the agent's pre-training out, as for a run that
             is about to be restored.
+        check: Is called during pre-training; what it raises ends it.
     """
     agent, env = setup.agent, setup.make_env(setup.train.num_envs, setup.train.task)
     started = time.perf_counter()
     state = _create(setup, env.goal_spec)
     if agent.pretrain and say is not None:
-        arguments = (setup.make_env, setup.seed, setup.folder, say)
+        arguments = (setup.make_env, setup.seed, setup.folder, say, check)
         state = pretrain.run(agent.pretrain, state, *arguments)
     seconds = time.perf_counter() - started if agent.pretrain and say is not None else 0.0
     encoder = None
