@@ -204,9 +204,11 @@ def resume(
         )
         config = dataclasses.replace(config, train=train)
         number = _chosen(folder, config, from_step)
+        setup = setup_of(config, folder)
+        state.check(setup)
         if number is None:
             folder.note_resume(config)
-        return _run_locked(config, folder, setup_of(config, folder), progress, number)
+        return _run_locked(config, folder, setup, progress, number)
 
 
 def load(path: str | Path) -> Policy:

@@ -30,7 +30,7 @@ def read(path: Path) -> Table:
         return {}
     try:
         header, *rows = _rows(path) or [[]]
-        whole = [row for row in rows if len(row) == len(header)]
+        whole = _whole(header, rows)
         columns = dict(zip(header, zip(*whole, strict=True), strict=False))
         return {
             name: np.array(values)
@@ -40,6 +40,19 @@ def read(path: Path) -> Table:
         }
     except (OSError, ValueError, csv.Error) as error:
         raise ConfigurationError(f"{path} cannot be read: {error}") from error
+
+
+def _whole(header: list[str], rows: list[list[str]]) -> list[list[str]]:
+    """Return the rows without a last one that is being written.
+
+    Raises:
+        ValueError: Another row has not as many values as there are columns.
+    """
+    for number, row in enumerate(rows, 2):
+        last = number == len(rows) + 1
+        if len(row) != len(header) and (len(row) > len(header) or not last):
+            raise ValueError(f"line {number} has {len(row)} values for {len(header)} columns")
+    return rows if not rows or len(rows[-1]) == len(header) else rows[:-1]
 
 
 def write(path: Path, table: Mapping[str, NumPyArray]) -> None:

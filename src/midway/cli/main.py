@@ -199,6 +199,9 @@ def sweep(
         check_settings(job, out, preset, changes)
     with Live(console=Console(stderr=True), refresh_per_second=1) as live:
         final = sweeps.run(wanted, out, lambda found: live.update(sweeps.table(found)), ray)
+    if any(status.state in ("stopped", "waiting") for status in final):
+        print_line(f"stopped; type the same command again to go on: {out}")
+        sys.exit(EXIT_SIGNAL + signal.SIGINT)
     failed = [status.job.name for status in final if status.state != "finished"]
     if failed:
         raise OSError(f"{len(failed)} runs failed ({', '.join(failed)}): see their .log in {out}")
@@ -389,6 +392,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _fail(EXIT_USAGE, error)
     except (NonFiniteError, BrokenEnvironmentError) as error:
         _fail(EXIT_FAILED, error)
+    except RuntimeError as error:
+        if "MUJOCO_GL" not in str(error):
+            raise
+        _fail(EXIT_USAGE, error)
     except KeyboardInterrupt:
         _fail(EXIT_SIGNAL + signal.SIGINT, "interrupted")
     except BrokenPipeError:

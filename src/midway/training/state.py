@@ -12,7 +12,7 @@ import numpy as np
 from midway.agent import AgentState, AnyAgent, Encoder, Memory
 from midway.replay import buffer
 from midway.replay.storage import ReplayState
-from midway.training import acting, freeze, pretrain, seeds, step
+from midway.training import acting, freeze, memory, pretrain, seeds, step
 from midway.training.arrays import named_arrays, with_named_arrays
 from midway.training.checkpoint import Checkpoints, Stored
 from midway.training.collect import Collector
@@ -123,13 +123,15 @@ def check(setup: Setup) -> None:
 
     Raises:
         ConfigurationError: A lane of the replay is too small, the agent cannot learn from this
-            environment, or the machine has fewer devices.
+            environment, the machine has fewer devices, or too little memory for replay, networks
+            and optimisers.
     """
     spec, train = setup.make_env(1, setup.train.task).goal_spec, setup.train
-    buffer.memory_bytes(spec, train.replay_capacity, train.num_envs)
+    replay = buffer.memory_bytes(spec, train.replay_capacity, train.num_envs)
     _devices(setup)
     key = seeds.training(setup.seed).network_key
-    eqx.filter_eval_shape(setup.agent.create, setup.hyperparameters, spec, key)
+    state = eqx.filter_eval_shape(setup.agent.create, setup.hyperparameters, spec, key)
+    memory.check({"replay": replay, "networks and optimisers": memory.of_state(state)})
 
 
 def start(setup: Setup, say: Say | None = None, check: Check = lambda: None) -> Training:
