@@ -70,10 +70,10 @@ def train(out: Path, **changes: object) -> Run:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """Return a file system of 640 kB."""
+    """Return a file system of 60 kB, less than a checkpoint takes."""
     path = tmp_path / "disk"
     path.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=640k", "none", path], check=False)
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=60k", "none", path], check=False)
     if mounted.returncode:
         pytest.skip("needs the right to mount")
     yield path
@@ -120,20 +120,10 @@ def test_a_folder_that_is_gone_is_said_in_one_line(
         if training.counters.steps == 48:
             (tmp_path / "run").rename(tmp_path / "elsewhere")
 
-    monkeypatch.setattr(loop, "advance", and_remove)
-    with pytest.raises(SystemExit) as stop:
-        main(
-            [
-                "train",
-                "point-u",
-                "--agent",
-                "sac",
-                "--out",
-                str(tmp_path / "run"),
-                "--set",
-                *CHANGES,
-            ]
-        )
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "advance", and_remove)
+        with pytest.raises(SystemExit) as stop:
+            main(command(tmp_path / "run"))
     assert stop.value.code == 1
     assert capsys.readouterr().err.splitlines()[-1].startswith("midway: ")
     assert midway.resume(tmp_path / "elsewhere").finished
