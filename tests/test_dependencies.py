@@ -42,6 +42,8 @@ EXTRAS = {
     for name, lines in PYPROJECT["project"]["optional-dependencies"].items()
 }
 DEV, ROBOTICS = EXTRAS.pop("dev"), EXTRAS.pop("robotics")
+ROBOTICS |= EXTRAS.pop("ogbench")
+assert EXTRAS["data"].pop("h5py")  # Minari reads its files by it
 OPTIONAL = {name for extra in EXTRAS.values() for name in extra}
 
 
@@ -80,7 +82,7 @@ def test_what_an_extra_installs_is_imported_where_it_is_needed() -> None:
     assert {name for name, inside in found_in(SOURCE, OPTIONAL) if not inside} & OPTIONAL == set()
 
 
-def test_the_extra_of_environments_holds_the_packages_that_are_found_by_their_ids() -> None:
+def test_the_extras_of_environments_hold_the_packages_that_are_found_by_their_ids() -> None:
     assert set(ROBOTICS) == set(map(canonical, PACKAGES))
 
 

@@ -1,14 +1,15 @@
 """The Python interface: train, resume, load, evaluate."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 from midway import presets
 from midway.agent import AnyAgent
 from midway.agents import registry as agents
-from midway.envs import foreign, layouts
+from midway.envs import datasets, foreign, layouts
 from midway.envs import registry as environments
 from midway.envs.foreign import EnvLike, Foreign, Settings
 from midway.envs.registry import Declaration
@@ -23,7 +24,7 @@ from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.logging import Logger
 from midway.training.progress import Reporter, Silent, reporter
 from midway.training.state import Training
-from midway.types import VectorGoalEnv
+from midway.types import Trajectory, VectorGoalEnv
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,6 +94,7 @@ def configure(
     preset: str = "quick",
     seed: int = 0,
     changes: Mapping[str, object] | None = None,
+    data: str | Path | None = None,
 ) -> RunConfig:
     """Return a preset with some values changed.
 
@@ -103,6 +105,7 @@ def configure(
         seed: The one seed of every generator, from 0.
         changes: Values by their field names in `TrainConfig` or the agent's ``Config``; text is
             read as Python literals.
+        data: Name or folder of a Minari dataset.
 
     Raises:
         ConfigurationError: A name is unknown or a value is not allowed.
@@ -119,6 +122,7 @@ def configure(
         *parts,
         foreign=declared.foreign.stored if declared.foreign else None,
         maze={"robot": declared.family, **declared.layout.to_json()} if declared.layout else None,
+        data=None if data is None else str(data),
     )
 
 
@@ -132,6 +136,7 @@ def train(
     num_envs: int | None = None,
     out: str | Path | None = None,
     precision: str | None = None,
+    data: str | Path | None = None,
     changes: Mapping[str, object] | None = None,
     progress: bool = False,
 ) -> Run:
@@ -147,6 +152,8 @@ def train(
         num_envs: Parallel environments; default: the preset's.
         out: The run folder; default: ``runs/ENV-AGENT-seedN``.
         precision: ``f32`` or ``bf16``; default: the preset's.
+        data: Name or folder of a Minari dataset of this environment, which the replay holds from
+            the beginning; with the setting ``collect=False`` nothing else is learned from.
         changes: Other settings, as in `configure`.
         progress: Whether to report on standard error.
 
@@ -159,7 +166,7 @@ def train(
     """
     named = {"steps": steps, "num_envs": num_envs, "precision": precision}
     given = {name: value for name, value in named.items() if value is not None}
-    config = configure(env, agent, preset, seed, {**(changes or {}), **given})
+    config = configure(env, agent, preset, seed, {**(changes or {}), **given}, data)
     folder = RunFolder(Path(out or Path("runs") / run_name(config.env, config.agent, seed)))
     setup = setup_of(config, folder)
     state.check(setup)
@@ -259,7 +266,24 @@ def setup_of(config: RunConfig, folder: RunFolder) -> state.Setup:
 
     agent = agents.get(config.agent)
     parts = (config.hyperparameters, config.train, config.seed, make_env, folder.path)
-    return state.Setup(agent, *parts)
+    return state.Setup(agent, *parts, _demonstrations(config, declared))
+
+
+def _demonstrations(
+    config: RunConfig, declared: Declaration
+) -> Callable[[], Iterable[Trajectory]] | None:
+    """Return what reads the trajectories of others that a run begins with.
+
+    Raises:
+        ConfigurationError: None are given where no step is taken, or for one of midway's own.
+    """
+    if config.data is None:
+        if not config.train.collect:
+            raise ConfigurationError("collect False: without --data there is nothing to learn from")
+        return None
+    if declared.foreign is None:
+        raise ConfigurationError(f"--data {config.data}: not for midway's own environments")
+    return partial(datasets.trajectories, config.data, declared.foreign)
 
 
 class RunSinks:

@@ -193,7 +193,7 @@ QUICK: tuple[Rule, ...] = (
     Rule(
         "quick",
         {
-            "steps": 160_000,
+            "steps": 240_000,
             "num_envs": 16,
             "updates_per_step": 0.5,
             "collect_limit": 300,

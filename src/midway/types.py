@@ -264,6 +264,18 @@ class Outcome(NamedTuple):
     desired: Float[Array, "B D"]
 
 
+class Trajectory(NamedTuple):
+    """One episode, or a part of one with a single goal.
+
+    Attributes:
+        observations: What is observed from the start to the last state ``(T + 1, ...)``, by name.
+        actions: The actions between them ``(T, action_dim)``, in [-1, 1].
+    """
+
+    observations: dict[str, NumPyArray]
+    actions: NumPyArray
+
+
 class Batch(NamedTuple):
     """Relabelled transitions; reward and terminated belong to ``goal``.
 

@@ -160,6 +160,24 @@ class Hidden(gymnasium.ObservationWrapper[Any, Any, Any]):
         return {**observation, "observation": observation["observation"][2:]}
 
 
+class Told(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """The plane where the goal is a whole observation, told in the info of a reset."""
+
+    def __init__(self) -> None:
+        super().__init__(gymnasium.wrappers.TimeLimit(Plane(reward="none"), 20))
+        spaces_of: Any = self.env.observation_space
+        self.observation_space = spaces_of["observation"]
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        shown, info = self.env.reset(seed=seed, options=options)
+        goal = np.concatenate([shown["desired_goal"], np.zeros(2)])
+        return shown["observation"], info | {"goal": goal}
+
+    def step(self, action: Any) -> Any:
+        shown, *others = self.env.step(action)
+        return shown["observation"], *others
+
+
 def limited(**options: Any) -> gymnasium.Env[Any, Any]:
     """The plane with twenty steps in an episode."""
     return gymnasium.wrappers.TimeLimit(Plane(**options), 20)

@@ -20,6 +20,7 @@ from gymnasium.error import ResetNeeded
 
 import midway
 from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, admit, describe, with_limit
+from midway.envs.goals_in_info import GoalsInInfo
 from midway.envs.sources import source
 from midway.errors import ConfigurationError, NonFiniteError
 from midway.training import seeds as midway_seeds
@@ -429,6 +430,27 @@ def test_a_state_tells_its_goal_and_how_far_states_vary() -> None:
     assert hidden.spec.goal_coordinates == (2, 3)
     observation, _ = ForeignVectorEnv(hidden, 3).reset(seed=0)
     np.testing.assert_array_equal(observation["observation"][:, 2:], observation["achieved_goal"])
+
+
+def told_in_two_coordinates() -> Any:
+    return GoalsInInfo(fakes.Told(), (0, 1))
+
+
+def test_goals_that_are_told_in_info_as_in_ogbench() -> None:
+    single = GoalsInInfo(fakes.Told())
+    shown, info = single.reset(seed=3)
+    np.testing.assert_array_equal(shown["desired_goal"], info["goal"])
+    np.testing.assert_array_equal(shown["achieved_goal"], shown["observation"])
+    after, *_ = single.step(np.array([1.0, 0.0], np.float32))
+    np.testing.assert_array_equal(after["desired_goal"], info["goal"])
+    foreign = describe(told_in_two_coordinates, Settings(success_distance=fakes.RADIUS))
+    assert (foreign.spec.goal_shape, foreign.spec.goal_coordinates) == ((2,), (0, 1))
+    shown = run(ForeignVectorEnv(foreign, 3), 30)
+    assert any(row["terminated"].any() for row in shown if "terminated" in row)
+    with pytest.raises(ConfigurationError, match="info has no goal"):
+        GoalsInInfo(gymnasium.make("Pendulum-v1")).reset()
+    with pytest.raises(ConfigurationError, match="need a vector"):
+        GoalsInInfo(fakes.limited())
 
 
 def test_what_is_no_environment_is_refused_by_name() -> None:

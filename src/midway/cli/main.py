@@ -34,6 +34,7 @@ def train(
     num_envs: OptionalCount = None,
     out: Path | None = None,
     precision: Literal["f32", "bf16"] | None = None,
+    data: str | None = None,
     set: tuple[str, ...] = (),
     about: AboutEnv = NOTHING,
 ) -> None:
@@ -48,6 +49,8 @@ def train(
         num_envs: Parallel environments; default: the preset's.
         out: Run folder; default: runs/ENV-AGENT-seedN.
         precision: Matrix products in float32 or bfloat16; default: the preset's.
+        data: Minari dataset (name or folder) that the replay begins with; with --set collect=False
+            nothing else is learned from.
         set: Other settings of the preset, as NAME=VALUE.
         about: What midway must be told of an environment that is not its own.
     """
@@ -62,6 +65,7 @@ def train(
         num_envs=num_envs,
         out=out,
         precision=precision,
+        data=data,
         changes=settings(set),
         progress=True,
     )

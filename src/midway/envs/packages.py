@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from midway.envs.goals_in_info import GoalsInInfo
+
 PACKAGES = {
     "gymnasium_robotics": r"(PointMaze|AntMaze|Fetch|Hand|Adroit|FrankaKitchen)",
     "panda_gym": r"Panda",
+    "ogbench": r"(visual-)?(pointmaze|antmaze|humanoidmaze|antsoccer|cube|scene|puzzle)-",
     "highway_env": r"(parking|highway|merge|roundabout|intersection|racetrack)",
 }
 """How the ids of each package begin."""
@@ -30,6 +33,14 @@ def hint(gym_id: str) -> str | None:
     if package is None or importlib.util.find_spec(package) is not None:
         return None
     return f"pip install {package.replace('_', '-')}"
+
+
+def adapted(gym_id: str, env: Any) -> Any:
+    """Return an environment with its goal in the observation, where its package has it in info."""
+    if _package(gym_id) != "ogbench":
+        return env
+    # In its mazes success is measured on x and y, which come first.
+    return GoalsInInfo(env, (0, 1) if "maze-" in gym_id else ())
 
 
 def fit_to_mujoco() -> None:

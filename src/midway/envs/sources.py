@@ -74,7 +74,7 @@ class Source:
             raise ConfigurationError(
                 f"{self.reference} gives {type(env).__name__}: must be a gymnasium.Env"
             )
-        return env
+        return packages.adapted(self.reference.rpartition(":")[2], env)
 
     def to_json(self) -> dict[str, Any]:
         """Return what a run folder stores.

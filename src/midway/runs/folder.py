@@ -52,6 +52,7 @@ class RunConfig:
         hyperparameters: The agent's ``Config``.
         foreign: What was decided about an environment that is not midway's, as JSON; None for
             midway's own, and for one that no other process could make.
+        data: Name or folder of a Minari dataset that the replay was filled with.
         maze: Robot and letters of a maze of one's own, as JSON.
     """
 
@@ -63,6 +64,7 @@ class RunConfig:
     hyperparameters: Hyperparameters
     foreign: JsonObject | None = None
     maze: JsonObject | None = None
+    data: str | None = None
 
     def declaration(self) -> Declaration:
         """Return the declaration of the environment.
@@ -112,6 +114,7 @@ class RunConfig:
                 hyperparameters=changed(agent.Config(), values["hyperparameters"]),
                 foreign=values.get("foreign"),
                 maze=values.get("maze"),
+                data=values.get("data"),
             )
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigurationError(f"configuration not understood: {error}") from error

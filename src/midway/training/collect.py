@@ -65,12 +65,13 @@ class Collector:
 
     @staticmethod
     def start(
-        env: VectorGoalEnv, replay: ReplayState, seed: int
+        env: VectorGoalEnv, replay: ReplayState, seed: int, limit: int = 0
     ) -> tuple["Collector", ReplayState]:
         """Reset every environment and begin its first episode in the replay."""
         observation, _ = env.reset(seed=seed)
         everyone = np.ones(env.num_envs, np.bool_)
-        return Collector(env, observation, everyone), step.begin(replay, observation, everyone)
+        collector = Collector(env, observation, everyone, limit=limit)
+        return collector, step.begin(replay, observation, everyone)
 
     def step(self, replay: ReplayState, choose: Actions) -> ReplayState:
         """Take one step in every environment; begin new episodes where one has ended.

@@ -48,6 +48,7 @@ class TrainConfig:
     collect_limit: int = setting(
         0, "not in the paper", "steps of an episode in collection; 0: the environment's", least=0
     )
+    collect: bool = setting(True, "ours", "whether steps are taken, or counted only")
     devices: int = setting(1, "ours", "accelerators that batch and replay are split over", least=1)
     task: str = setting("uniform", "appendix C", "starts and goals that are trained on")
 

@@ -59,9 +59,11 @@ def advance(training: Training) -> None:
     """Take one step in every environment, then the updates that are due."""
     started = time.perf_counter()
     train, key = training.setup.train, training.streams.update_key
-    training.replay = training.collector.step(training.replay, partial(_choose, training))
-    if not training.collector.moved:
-        return
+    if train.collect:
+        choose = partial(_choose, training)
+        training.replay = training.collector.step(training.replay, choose)
+        if not training.collector.moved:
+            return
     if (begun := training.collector.begun).any():
         fresh = training.begin_episodes(train.num_envs)
         training.memory = acting.renew(training.memory, fresh, begun)

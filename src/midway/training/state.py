@@ -1,6 +1,7 @@
 """A run in memory: what its future depends on, how it starts, is frozen and is restored."""
 
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -10,9 +11,10 @@ import equinox as eqx
 import numpy as np
 
 from midway.agent import AgentState, AnyAgent, Encoder, Memory
+from midway.errors import ConfigurationError
 from midway.replay import buffer
 from midway.replay.storage import ReplayState
-from midway.training import acting, freeze, memory, pretrain, seeds, step
+from midway.training import acting, demonstrations, freeze, memory, pretrain, seeds, step
 from midway.training.arrays import named_arrays, with_named_arrays
 from midway.training.checkpoint import Checkpoints, Stored
 from midway.training.collect import Collector
@@ -20,7 +22,7 @@ from midway.training.config import TrainConfig
 from midway.training.devices import Devices
 from midway.training.pretrain import Check, MakeEnv, Say
 from midway.training.step import Arrays, Program
-from midway.types import EnvSpec, Hyperparameters, Metrics, VectorGoalEnv
+from midway.types import EnvSpec, Hyperparameters, Metrics, Trajectory, VectorGoalEnv
 
 FROZEN = "frozen_encoder"
 """Part of a checkpoint that is there once the encoder is frozen."""
@@ -37,6 +39,7 @@ class Setup:
         seed: The one seed of every generator.
         make_env: ``(number of environments, task) -> vector environment``.
         folder: Where pre-training keeps its files.
+        demonstrations: Trajectories of others, which the replay holds from the beginning.
     """
 
     agent: AnyAgent
@@ -45,6 +48,7 @@ class Setup:
     seed: int
     make_env: MakeEnv
     folder: Path
+    demonstrations: Callable[[], Iterable[Trajectory]] | None = None
 
 
 class Counters(NamedTuple):
@@ -154,7 +158,29 @@ def start(setup: Setup, say: Say | None = None, check: Check = lambda: None) -> 
     if agent.freezing and agent.freezing.at_start and env.goal_spec.is_image:
         encoder = agent.freezing.encoder(state)
         state = freeze.keep(agent, _create(setup, _spec(env.goal_spec, encoder)), state)
-    return _begin(setup, env, state, encoder, Counters(seconds=seconds))
+    training = _begin(setup, env, state, encoder, Counters(seconds=seconds))
+    if setup.demonstrations is not None and say is not None:
+        _demonstrate(training, setup.demonstrations(), say)
+    return training
+
+
+def _demonstrate(training: Training, trajectories: Iterable[Trajectory], say: Say) -> None:
+    """Put trajectories of others into the replay, and begin the episodes anew behind them.
+
+    Raises:
+        ConfigurationError: There are none, or the agent reads features of images already.
+    """
+    setup, spec = training.setup, training.program.spec
+    if training.encoder is not None:
+        raise ConfigurationError(
+            "images of others do not go with an encoder that is frozen already"
+        )
+    train, env = setup.train, training.collector.env
+    replay, count = demonstrations.fill(training.replay, spec, train.num_envs, trajectories)
+    training.collector, training.replay = Collector.start(
+        env, replay, training.streams.env, train.collect_limit
+    )
+    say(f"{count} steps of others in the replay")
 
 
 def _begin(
@@ -172,8 +198,7 @@ def _begin(
     replay = devices.allocate(allocate)
     totals = step.empty_totals(setup.agent, program, arrays, train, replay)
     streams = _streams(setup)
-    collector, replay = Collector.start(env, replay, streams.env)
-    collector.limit = train.collect_limit
+    collector, replay = Collector.start(env, replay, streams.env, train.collect_limit)
     parts = (program, arrays, devices.copied(totals), replay, (), collector, streams)
     training = Training(setup, *parts, encoder, counters)
     training.memory = training.begin_episodes(train.num_envs)

@@ -1,0 +1,49 @@
+"""Environments that tell their goal in the info of a reset, as those of OGBench do."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from midway.errors import ConfigurationError
+
+
+class GoalsInInfo(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Observes what the environment does, with the goal that its info told at the last reset.
+
+    Args:
+        env: An environment whose ``reset`` returns an observation as the goal, ``info["goal"]``.
+        coordinates: The entries of it that make a goal; all of them where there are none.
+    """
+
+    def __init__(self, env: Any, coordinates: tuple[int, ...] = ()) -> None:
+        super().__init__(env)
+        shown = env.observation_space
+        if not isinstance(shown, spaces.Box) or len(shown.shape) != 1:
+            raise ConfigurationError(f"its observations are {shown}: goals in info need a vector")
+        self._coordinates = np.array(coordinates or range(shown.shape[0]))
+        sides = (shown.low.astype(np.float64), shown.high.astype(np.float64))
+        bounds = (side[self._coordinates] for side in sides)
+        goal = spaces.Box(*bounds, dtype=np.float64)
+        entries: dict[str, spaces.Space[Any]] = {"observation": shown, "achieved_goal": goal}
+        entries["desired_goal"] = goal
+        self.observation_space = spaces.Dict(entries)
+        self._goal = np.zeros(goal.shape)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Begin an episode with a goal of the environment's own."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        if "goal" not in info:
+            raise ConfigurationError("its info has no goal after a reset")
+        self._goal = np.asarray(info["goal"], np.float64)[self._coordinates]
+        return self._see(observation), info
+
+    def step(self, action: Any) -> Any:
+        """Move by one step."""
+        observation, *others = self.env.step(action)
+        return self._see(observation), *others
+
+    def _see(self, observation: Any) -> dict[str, Any]:
+        achieved = np.asarray(observation, np.float64)[self._coordinates]
+        return {"observation": observation, "achieved_goal": achieved, "desired_goal": self._goal}
