@@ -24,7 +24,6 @@ EDGES = {
     "--set steps=nan": "steps",
     "--steps nan": "nan is not a whole number",
     "--steps 1e400": "1e400 is not a whole number",
-    "--set precision=f64": "choose one of f32, bf16",
     "--precision f64": "invalid choice 'f64'",
 }
 
