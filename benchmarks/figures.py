@@ -63,6 +63,11 @@ FIGURES = {
         ("point-u-ris-seed0",), "point-u-ris-subgoals", "docs/images/point-u-subgoals.png", True
     ),
     "ant-u": Source(("ant-u/*",), "ant-u-learning-curves", "benchmarks/figures/ant-u.png"),
+    "ant-u-fast": Source(
+        ("ant-u-fast/*", "ant-u/ant-u-ris-*"),
+        "ant-u-learning-curves",
+        "benchmarks/figures/ant-u-fast.png",
+    ),
     "push-state": Source(
         ("push-state/*",), "push-state-learning-curves", "benchmarks/figures/push-state.png"
     ),

@@ -30,6 +30,8 @@ WATCHING = ("steps", "evaluate_every", "evaluation_episodes", "log_every", "chec
 METRICS = ("step", "updates", "seconds")
 EVALUATION = (*METRICS, "task", "actions", "success_rate", "final_distance")
 """Columns without which a file cannot be of a run."""
+NAMED_SETTINGS = 3
+"""Settings that tell groups of an agent apart in legends, at most."""
 
 
 @dataclass(frozen=True)
@@ -284,8 +286,17 @@ def _settings(config: RunConfig) -> JsonObject:
 
 
 def _differences(config: RunConfig, gathered: Sequence[Sequence[RunData]]) -> list[str]:
-    """Return the settings of this group that differ from another group of the same agent."""
+    """Return the settings in which this group stands apart from others of the same agent.
+
+    What most groups have is not named; of many settings the first are.
+    """
     mine = _settings(config)
     rivals = [members[0].config for members in gathered]
-    others = [_settings(rival) for rival in rivals if rival.agent == config.agent]
-    return [f"{name} {mine[name]}" for name in mine if any(o[name] != mine[name] for o in others)]
+    groups = [_settings(rival) for rival in rivals if rival.agent == config.agent]
+    apart = [
+        f"{name} {value}"
+        for name, value in mine.items()
+        if 2 * sum(group[name] == value for group in groups) <= len(groups)
+    ]
+    more = len(apart) - NAMED_SETTINGS
+    return apart if more <= 0 else [*apart[:NAMED_SETTINGS], f"{more} more settings"]
