@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -12,13 +13,13 @@ from midway.envs import datasets, foreign, layouts
 from midway.envs import registry as environments
 from midway.envs.foreign import EnvLike, Foreign, Settings
 from midway.envs.registry import Declaration
-from midway.errors import ConfigurationError
+from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
 from midway.runs import complete
 from midway.runs import policy as policies
 from midway.runs.folder import RunConfig, RunFolder, run_name
 from midway.runs.policy import Policy
-from midway.training import loop, seeds, state
-from midway.training.checkpoint import Checkpoints
+from midway.training import loop, seeds, signals, state
+from midway.training.checkpoint import Checkpoints, steps_in
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.logging import Logger
 from midway.training.progress import Reporter, Silent, reporter
@@ -33,10 +34,12 @@ class Run:
     Attributes:
         path: The run folder.
         finished: Whether all steps were taken.
+        signal: The signal that ended it before, if one did.
     """
 
     path: Path
     finished: bool
+    signal: int | None = None
 
 
 def goal_env(
@@ -157,6 +160,9 @@ def train(
     Raises:
         ConfigurationError: A name, value or folder cannot be used.
         NonFiniteError: A loss became NaN or infinite; the last good checkpoint is kept.
+        BrokenEnvironmentError: An environment raised, or showed what is not finite; a checkpoint
+            is written before.
+        OSError: A file cannot be written; the checkpoints before are kept.
     """
     named = {"steps": steps, "num_envs": num_envs, "precision": precision}
     given = {name: value for name, value in named.items() if value is not None}
@@ -191,6 +197,8 @@ def resume(
         ConfigurationError: This is no run folder, another process trains it, its checkpoint is
             damaged, missing or foreign, or the machine has fewer devices.
         NonFiniteError: A loss became NaN or infinite.
+        BrokenEnvironmentError: As `train`.
+        OSError: As `train`.
     """
     folder = RunFolder(Path(path))
     folder.load_config()  # a folder that is no run's is refused without a lock in it
@@ -203,9 +211,11 @@ def resume(
         )
         config = dataclasses.replace(config, train=train)
         number = _chosen(folder, config, from_step)
+        setup = setup_of(config, folder)
+        state.check(setup)
         if number is None:
             folder.note_resume(config)
-        return _run_locked(config, folder, setup_of(config, folder), progress, number)
+        return _run_locked(config, folder, setup, progress, number)
 
 
 def load(path: str | Path) -> Policy:
@@ -341,37 +351,75 @@ def _chosen(folder: RunFolder, config: RunConfig, from_step: int | None) -> int 
 def _run_locked(
     config: RunConfig, folder: RunFolder, setup: state.Setup, progress: bool, number: int | None
 ) -> Run:
-    """Restore the checkpoint of a step, if one is given; then train."""
+    """Restore the checkpoint of a step, if one is given; then train.
+
+    Raises:
+        NonFiniteError: As `train`, with what is there to go on from.
+    """
     folder.remove_unfinished()
     checkpoints = Checkpoints(folder.checkpoints, folder.owner(config))
     checkpoints.remove_unfinished()
     say: Reporter = reporter(config.train.steps, number or 0) if progress else Silent()
-    logger = None
+    try:
+        with signals.listening() as asked, closing(say), closing(checkpoints):
+            try:
+                finished = _run(config, folder, setup, (checkpoints, say), number, asked)
+            except signals.Interrupted:
+                say.message(f"{folder.path}: interrupted before its first step")
+                finished = False
+            return Run(folder.path, finished, None if finished else asked.end)
+    except (NonFiniteError, BrokenEnvironmentError) as error:
+        raise type(error)(f"{error}; {_kept(folder)}") from error
+
+
+def _run(
+    config: RunConfig,
+    folder: RunFolder,
+    setup: state.Setup,
+    parts: tuple[Checkpoints, Reporter],
+    number: int | None,
+    asked: signals.Asked,
+) -> bool:
+    """Restore and train; return whether the run is finished.
+
+    Raises:
+        Interrupted: A signal ended it before its first step.
+    """
+    checkpoints, say = parts
     if rule := config.rule_of_success:
         say.message(rule)
-    try:
-        training = state.start(setup, say.message if number is None else None)
-        if number is not None:
-            training = state.restore(training, checkpoints, number)
-            folder.note_resume(config)
-        steps = training.counters.steps
-        checkpoints.set_aside_after(steps)
-        logger = Logger(folder.metrics_file, folder.evaluation_file, folder.path / "events", steps)
+    training = state.start(setup, say.message if number is None else None, asked.check)
+    if number is not None:
+        training = state.restore(training, checkpoints, number)
+        folder.note_resume(config)
+    steps = training.counters.steps
+    checkpoints.set_aside_after(steps)
+    files = folder.metrics_file, folder.evaluation_file, folder.path / "events"
+    with closing(Logger(*files, steps, say.message)) as logger:
         sinks = RunSinks(config, folder, logger, checkpoints, say)
         if number is not None:
-            _complete(training, sinks, folder)
-        return Run(folder.path, loop.run(training, sinks))
-    finally:
-        say.close()
-        if logger is not None:
-            logger.close()
-        checkpoints.close()
+            _complete(training, sinks, folder, asked)
+        return loop.run(training, sinks, asked)
 
 
-def _complete(training: Training, sinks: RunSinks, folder: RunFolder) -> None:
-    """Write what a process that was killed, or somebody, left out beside the checkpoint."""
-    steps = training.counters.steps
+def _complete(training: Training, sinks: RunSinks, folder: RunFolder, asked: signals.Asked) -> None:
+    """Write what a process that was ended, or somebody, left out beside the checkpoint.
+
+    Raises:
+        Interrupted: A signal ended the evaluation again.
+    """
+    steps, train = training.counters.steps, training.setup.train
     if complete.policy_step(folder) != steps:
         sinks.policy(training)
-    if steps >= training.setup.train.steps and not complete.is_evaluated(folder, steps):
-        loop.note_evaluation(training, sinks)
+    due = loop.is_due(training, train.evaluate_every)
+    if due and not complete.is_evaluated(folder, steps):
+        loop.take_evaluation(training, sinks, {}, asked)
+        asked.check()
+
+
+def _kept(folder: RunFolder) -> str:
+    """Return what a run that was stopped can go on from."""
+    newest = max(steps_in(folder.checkpoints), default=None)
+    if newest is None:
+        return "there is no checkpoint yet"
+    return f"go on from the checkpoint of step {newest}: midway resume {folder.path}"

@@ -7,3 +7,11 @@ class ConfigurationError(ValueError):
 
 class NonFiniteError(RuntimeError):
     """A loss or value became NaN or infinite; its text names the quantity."""
+
+
+class BrokenEnvironmentError(RuntimeError):
+    """An environment raised or shows what cannot be used; its text names copy and step."""
+
+
+class NonFiniteObservationError(BrokenEnvironmentError, NonFiniteError):
+    """An environment shows a number that is not finite."""

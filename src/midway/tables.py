@@ -30,7 +30,7 @@ def read(path: Path) -> Table:
         return {}
     try:
         header, *rows = _rows(path) or [[]]
-        whole = [row for row in rows if len(row) == len(header)]
+        whole = _whole(header, rows)
         columns = dict(zip(header, zip(*whole, strict=True), strict=False))
         return {
             name: np.array(values)
@@ -40,6 +40,19 @@ def read(path: Path) -> Table:
         }
     except (OSError, ValueError, csv.Error) as error:
         raise ConfigurationError(f"{path} cannot be read: {error}") from error
+
+
+def _whole(header: list[str], rows: list[list[str]]) -> list[list[str]]:
+    """Return the rows without a last one that is being written.
+
+    Raises:
+        ValueError: Another row has not as many values as there are columns.
+    """
+    for number, row in enumerate(rows, 2):
+        last = number == len(rows) + 1
+        if len(row) != len(header) and (len(row) > len(header) or not last):
+            raise ValueError(f"line {number} has {len(row)} values for {len(header)} columns")
+    return rows if not rows or len(rows[-1]) == len(header) else rows[:-1]
 
 
 def write(path: Path, table: Mapping[str, NumPyArray]) -> None:
@@ -58,6 +71,10 @@ class Appender:
     Args:
         path: The file.
         until: Keep only rows up to this step: what follows will be computed again.
+
+    Raises:
+        ConfigurationError: The file holds something else.
+        OSError: It cannot be read or written.
     """
 
     def __init__(self, path: Path, until: int) -> None:
@@ -70,23 +87,35 @@ class Appender:
         """Append one row and put it on disk.
 
         Values of columns that the first row did not have are not written.
+
+        Raises:
+            OSError: It cannot be written; a part of it may be there.
         """
         if self._columns is None:
             self._columns = list(row)
-            with self._path.open("w", newline="") as file:
-                csv.writer(file).writerow(self._columns)
-        with self._path.open("a", newline="") as file:
-            csv.writer(file).writerow([row.get(column, "") for column in self._columns])
+            _replace(self._path, [self._columns])
+        values = [row.get(column, "") for column in self._columns]
+        try:
+            with self._path.open("a", newline="") as file:
+                csv.writer(file).writerow(values)
+        except OSError as error:
+            raise files.named(error, self._path) from error
 
     def _truncate(self, until: int) -> None:
-        rows = _rows(self._path)
-        if not rows:
-            return
-        self._columns = rows[0]
-        step = self._columns.index("step")
-        # A last line that a killed process wrote in part has too few values.
-        kept = [r for r in rows[1:] if len(r) == len(rows[0]) and int(r[step]) <= until]
-        _replace(self._path, [rows[0], *kept])
+        try:
+            rows = _rows(self._path) or [[]]
+            # A last line that a killed process wrote in part has too few values.
+            whole = [row for row in rows[1:] if len(row) == len(rows[0])]
+            kept = [row for row in whole if int(row[rows[0].index("step")]) <= until]
+        except (ValueError, csv.Error) as error:
+            raise ConfigurationError(
+                f"{self._path} is damaged, rename it to go on: {error}"
+            ) from error
+        if kept:
+            self._columns = rows[0]
+            _replace(self._path, [rows[0], *kept])
+        else:  # the first row decides the columns anew
+            self._path.unlink()
 
 
 def _rows(path: Path) -> list[list[str]]:

@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import signal
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,13 +13,16 @@ from tyro.conf import Positional, arg
 
 from midway.cli.about import NOTHING, AboutEnv
 from midway.cli.parsing import Count, OptionalCount, parse, plain, settings
-from midway.errors import ConfigurationError, NonFiniteError
+from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
+from midway.training.terminal import print_line
 
 if TYPE_CHECKING:
     from midway.api import Run
 
 EXIT_FAILED = 1
 EXIT_USAGE = 2
+EXIT_SIGNAL = 128
+"""To which the number of the signal that ended a run is added."""
 
 
 def train(
@@ -198,6 +203,9 @@ def sweep(
         check_settings(job, out, preset, changes)
     with Live(console=Console(stderr=True), refresh_per_second=1) as live:
         final = sweeps.run(wanted, out, lambda found: live.update(sweeps.table(found)), ray)
+    if any(status.state in ("stopped", "waiting") for status in final):
+        print_line(f"stopped; type the same command again to go on: {out}")
+        sys.exit(EXIT_SIGNAL + signal.SIGINT)
     failed = [status.job.name for status in final if status.state != "finished"]
     if failed:
         raise OSError(f"{len(failed)} runs failed ({', '.join(failed)}): see their .log in {out}")
@@ -376,7 +384,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one command; exit with 0, 1 (failed while running) or 2 (wrong use)."""
+    """Run one command; exit with 0, 1 (failed while running), 2 (wrong use) or 128 + a signal."""
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         command = parse(COMMANDS, arguments)
@@ -386,18 +394,31 @@ def main(arguments: Sequence[str] | None = None) -> None:
         command()
     except ConfigurationError as error:
         _fail(EXIT_USAGE, error)
-    except NonFiniteError as error:
-        _fail(EXIT_FAILED, f"{error}; the last good checkpoint is kept")
+    except (NonFiniteError, BrokenEnvironmentError) as error:
+        _fail(EXIT_FAILED, error)
+    except RuntimeError as error:
+        if "MUJOCO_GL" not in str(error):
+            raise
+        _fail(EXIT_USAGE, error)
+    except KeyboardInterrupt:
+        _fail(EXIT_SIGNAL + signal.SIGINT, "interrupted")
     except BrokenPipeError:
         sys.stdout = None
         sys.exit(EXIT_FAILED)
     except (OSError, MemoryError) as error:
-        _fail(EXIT_FAILED, error)
+        _fail(EXIT_FAILED, _described(error))
+
+
+def _described(error: OSError | MemoryError) -> str:
+    """Return what the error says, its file first."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
 
 
 def _fail(status: int, error: object) -> None:
     text = " ".join(str(error).split())
-    print(f"midway: {text}", file=sys.stderr)
+    print_line(f"midway: {text}")
     sys.exit(status)
 
 
@@ -416,4 +437,7 @@ def _print_json(value: object) -> None:
 
 def _say_where(run: "Run") -> None:
     state = "finished" if run.finished else "stopped; continue with: midway resume"
-    print(f"{state} {run.path}")
+    with suppress(BrokenPipeError):  # whoever reads may have ended by the same signal
+        print(f"{state} {run.path}", flush=True)
+    if run.signal is not None:
+        sys.exit(EXIT_SIGNAL + run.signal)

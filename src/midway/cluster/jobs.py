@@ -1,12 +1,13 @@
 """One run of a sweep: its command, its folder, and how far it is."""
 
+import signal
 import subprocess
 import sys
-import time
-from collections.abc import Mapping
+import threading
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from midway.runs import complete
 from midway.runs.folder import RunFolder, run_name
 from midway.settings import changed, split
 
-State: TypeAlias = Literal["waiting", "running", "finished", "failed"]
+State: TypeAlias = Literal["waiting", "running", "finished", "failed", "stopped"]
 
 POLL_SECONDS = 1.0
 RELEASE_SECONDS = 120.0
@@ -62,26 +63,70 @@ class Job:
         return int(given[-1]) if given else None
 
 
-def execute(job: Job, folder: Path, core: int | None = None) -> bool:
-    """Run a job in a process of its own, on one core if given; return whether it is finished.
+class Processes:
+    """The processes of the runs that are going on, which can be ended together."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self.ending = threading.Event()
+
+    def run(self, command: Sequence[str], log: Path) -> int:
+        """Run a command, what it says in a file; return its status.
+
+        It is in a group of its own: a terminal's Ctrl-C reaches it through `end` alone, once.
+        """
+        with log.open("a") as file:
+            streams: Any = {"stdin": subprocess.DEVNULL, "stdout": file}
+            with self._lock:
+                if self.ending.is_set():
+                    return 128 + signal.SIGTERM
+                process = subprocess.Popen(
+                    command, **streams, stderr=subprocess.STDOUT, process_group=0
+                )
+                self._running.add(process)
+            status = process.wait()
+        with self._lock:
+            self._running.discard(process)
+        return status
+
+    def end(self) -> None:
+        """Let each process write its checkpoint and end, and start no other."""
+        with self._lock:
+            self.ending.set()
+            for process in self._running:
+                process.terminate()
+
+    def kill(self) -> None:
+        """End each process at once."""
+        with self._lock:
+            for process in self._running:
+                process.kill()
+
+
+def execute(
+    job: Job, folder: Path, core: int | None = None, processes: Processes | None = None
+) -> State:
+    """Run a job in a process of its own, on one core if given; return how it ended.
 
     The process dies with its parent: a machine's or worker's end must not leave a second writer.
     """
-    _wait_until_free(RunFolder(folder / job.name))
+    processes = processes or Processes()
+    _wait_until_free(RunFolder(folder / job.name), processes.ending)
     command = ["setpriv", "--pdeathsig", "KILL", *job.command(folder / job.name)]
     if core is not None:
         command = ["taskset", "-c", str(core), *command]
-    with (folder / f"{job.name}.log").open("a") as log:
-        ended = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False)
-    return ended.returncode == 0 and finished(job, folder)
+    status = processes.run(command, folder / f"{job.name}.log")
+    if status == 0 and finished(job, folder):
+        return "finished"
+    return "stopped" if processes.ending.is_set() else "failed"
 
 
-def _wait_until_free(run_folder: RunFolder) -> None:
+def _wait_until_free(run_folder: RunFolder, ending: threading.Event) -> None:
     """Wait for a process that has lost its worker, and is about to die, to let go of the run."""
     for _ in range(int(RELEASE_SECONDS / POLL_SECONDS)):
-        if not run_folder.in_use():
+        if not run_folder.in_use() or ending.wait(POLL_SECONDS):
             return
-        time.sleep(POLL_SECONDS)
 
 
 def finished(job: Job, folder: Path) -> bool:

@@ -68,7 +68,7 @@ def _check_reached(address: str) -> None:
 
 
 def _run_to_its_end(job: Job, folder: str) -> bool:
-    return execute(job, Path(folder))
+    return execute(job, Path(folder)) == "finished"
 
 
 def _result(ray: Any, reference: object) -> State:

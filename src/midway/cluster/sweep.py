@@ -6,15 +6,27 @@ finished and resumes what was interrupted.
 
 import os
 import queue
+import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING
 
 from midway.cluster import on_ray
-from midway.cluster.jobs import POLL_SECONDS, Job, State, execute, finished, last_line, last_success
+from midway.cluster.jobs import (
+    POLL_SECONDS,
+    Job,
+    Processes,
+    State,
+    execute,
+    finished,
+    last_line,
+    last_success,
+)
 from midway.errors import ConfigurationError
 from midway.runs.folder import RunFolder
 
@@ -72,17 +84,54 @@ def run(
         raise ConfigurationError(f"cannot make sweep folder {folder}: {error.strerror}") from error
     states: dict[Job, State] = dict.fromkeys(wanted, "waiting")
     if ray_address is None:
-        workers = _local_workers(wanted, folder, states)
+        processes = Processes()
+        workers = _local_workers(wanted, folder, states, processes)
+        with _ending(processes):
+            _watch(workers, folder, states, show)
     else:
-        workers = on_ray.start(wanted, folder, states, ray_address)
+        _watch(on_ray.start(wanted, folder, states, ray_address), folder, states, show)
+    final = statuses(folder, states)
+    show(final)
+    return final
+
+
+def _watch(
+    workers: Sequence[threading.Thread],
+    folder: Path,
+    states: dict[Job, State],
+    show: Callable[[list[Status]], None],
+) -> None:
     for worker in workers:
         worker.start()
     while any(worker.is_alive() for worker in workers):
         show(statuses(folder, states))
         time.sleep(POLL_SECONDS)
-    final = statuses(folder, states)
-    show(final)
-    return final
+
+
+@contextmanager
+def _ending(processes: Processes) -> Iterator[None]:
+    """Let the first signal end all runs with a checkpoint, and the second one at once.
+
+    Raises:
+        KeyboardInterrupt: There was a second signal.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    names = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+    def note(number: int, frame: FrameType | None) -> None:
+        if processes.ending.is_set():
+            processes.kill()
+            raise KeyboardInterrupt
+        processes.end()
+
+    previous = {name: signal.signal(name, note) for name in names}
+    try:
+        yield
+    finally:
+        for name in names:
+            signal.signal(name, previous[name])
 
 
 def statuses(folder: Path, states: dict[Job, State]) -> list[Status]:
@@ -96,7 +145,7 @@ def statuses(folder: Path, states: dict[Job, State]) -> list[Status]:
 
 
 def _local_workers(
-    wanted: Sequence[Job], folder: Path, states: dict[Job, State]
+    wanted: Sequence[Job], folder: Path, states: dict[Job, State], processes: Processes
 ) -> list[threading.Thread]:
     """Return one thread for each core; each takes jobs until none is left."""
     waiting: queue.SimpleQueue[Job] = queue.SimpleQueue()
@@ -104,14 +153,14 @@ def _local_workers(
         waiting.put(job)
 
     def work(core: int) -> None:
-        while True:
+        while not processes.ending.is_set():
             try:
                 job = waiting.get_nowait()
             except queue.Empty:
                 return
             states[job] = "running"
-            done = finished(job, folder) or execute(job, folder, core)
-            states[job] = "finished" if done else "failed"
+            done = finished(job, folder)
+            states[job] = "finished" if done else execute(job, folder, core, processes)
 
     cores = sorted(os.sched_getaffinity(0))
     return [threading.Thread(target=work, args=(core,), daemon=True) for core in cores]

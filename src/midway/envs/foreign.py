@@ -25,7 +25,7 @@ from midway.envs.sources import Source, source
 from midway.envs.success import Rule, judge, reference_of
 from midway.envs.vector import Array, GoalVectorEnv
 from midway.envs.workers import Workers
-from midway.errors import ConfigurationError, NonFiniteError
+from midway.errors import ConfigurationError, NonFiniteObservationError
 from midway.types import DistanceTask, EnvSpec, Observations, Step, UnknownTask
 
 CHEAP_SECONDS = 0.002
@@ -301,7 +301,8 @@ class ForeignVectorEnv(GoalVectorEnv):
 
         Raises:
             ConfigurationError: The environment's info contradicts its rule of success.
-            NonFiniteError: What it observes is not finite.
+            NonFiniteObservationError: What it observes is not finite.
+            BrokenEnvironmentError: It raises, or observes something else than its space.
         """
         observations, reward, _, truncated, info = super().step(actions)
         reached, ended = info["is_success"], self._held["terminated"] == 1
@@ -346,23 +347,31 @@ class ForeignVectorEnv(GoalVectorEnv):
     def _advance(self, actions: Shaped[Array, "num_envs action_dim"]) -> None:
         actions = np.where(self._resting[:, None], np.nan, actions).astype(np.float32)
         if self._workers is not None:
-            self._hold(self._workers.step(actions))
+            self._hold(self._workers.step(actions), actions)
         elif self._group is not None:
-            self._hold(self._group.step(actions)[0])
+            self._hold(self._group.step(actions)[0], actions)
 
-    def _hold(self, shown: Mapping[str, Array]) -> None:
+    def _moment(self, copy: int, actions: Array | None) -> str:
+        """Say when in its episode an environment was asked for what it shows."""
+        if actions is None:
+            return "after its reset"
+        step = int(self._elapsed[copy]) + 1
+        return f"in step {step} of its episode, after action {actions[copy].tolist()}"
+
+    def _hold(self, shown: Mapping[str, Array], actions: Array | None = None) -> None:
         """Keep what the environments show, apart from the memory that they share.
 
         Raises:
-            NonFiniteError: Something is not finite.
+            NonFiniteObservationError: Something is not finite.
         """
         self._held = {name: batch.copy() for name, batch in shown.items()}
         for name in self.single_observation_space:
             batch = self._held[name]
             if batch.dtype != np.uint8 and not np.isfinite(batch).all():
                 copy = int(np.flatnonzero(~np.isfinite(batch.reshape(self.num_envs, -1)).all(1))[0])
-                raise NonFiniteError(
-                    f"{self.goal_spec.name}: {name} of environment {copy} is not finite"
+                raise NonFiniteObservationError(
+                    f"{self.goal_spec.name}: {name} of environment {copy} is not finite "
+                    f"{self._moment(copy, actions)}"
                 )
 
     def _observe(self) -> Observations:

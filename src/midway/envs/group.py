@@ -1,8 +1,9 @@
 """Several environments that are not midway's, stepped one after the other by one process."""
 
+import contextlib
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import gymnasium
@@ -11,6 +12,7 @@ from gymnasium import spaces
 
 from midway.envs.reading import Array, Reading, readings, word_of
 from midway.envs.sources import Source, printing_to_stderr
+from midway.errors import BrokenEnvironmentError
 
 FLAGS = ("terminated", "truncated", "word")
 """What each environment said of its last step; ``word``: of success, -1 where it said nothing."""
@@ -60,6 +62,7 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
         self.observation_space: spaces.Space[Any] = shown
         self.action_space = spaces.Box(-1, 1, (size, self.low.size), np.float32)
         self.envs: list[Any] = []
+        self.lengths = [0 for _ in self.places]
         self.held: dict[str, Array] = {
             name: np.zeros(box.shape or (), box.dtype) for name, box in shown.items()
         }
@@ -74,9 +77,10 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
             self.envs = [make(self.limit, self.render_mode) for _ in self.places]
         for place, index in enumerate(self.places):
             if mask[index]:
-                with printing_to_stderr():
+                self.lengths[place] = 0
+                with self._naming(place, None), printing_to_stderr():
                     observation, info = self.envs[place].reset(seed=int(seeds[index]))
-                self._hold(place, observation, info, False, False)
+                    self._hold(place, observation, info, False, False)
         return self.held, {}
 
     def step(self, actions: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
@@ -87,8 +91,10 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
                 self._flag(place, False, False, -1)
                 continue
             action = scaled[place].reshape(env.action_space.shape).astype(env.action_space.dtype)
-            observation, _, terminated, truncated, info = env.step(action)
-            self._hold(place, observation, info, terminated, truncated)
+            self.lengths[place] += 1
+            with self._naming(place, action):
+                observation, _, terminated, truncated, info = env.step(action)
+                self._hold(place, observation, info, terminated, truncated)
         return self.held, 0.0, False, False, {}
 
     def render(self) -> list[Any]:  # type: ignore[override]
@@ -103,9 +109,27 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
 
     def work_alone(self) -> None:
         """Leave signals to the process that trains, which ends this one when it is done."""
-        for name in (signal.SIGINT, signal.SIGTERM):
+        for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
             signal.signal(name, signal.SIG_IGN)
         os.dup2(2, 1)
+
+    @contextlib.contextmanager
+    def _naming(self, place: int, action: Array | None) -> Iterator[None]:
+        """Say which environment raised, and when.
+
+        Raises:
+            BrokenEnvironmentError: It did, or observes something else than its space.
+        """
+        try:
+            yield
+        except Exception as error:  # whatever the code of others raises
+            when = "in its reset"
+            if action is not None:
+                when = f"in step {self.lengths[place]} of its episode, action {action.tolist()}"
+            raise BrokenEnvironmentError(
+                f"{self.source.reference}: environment {self.places[place]}, {when}: "
+                f"{type(error).__name__}: {error}"
+            ) from error
 
     def _hold(
         self, place: int, observation: Mapping[str, Any], info: Mapping[str, Any], *ends: bool

@@ -5,6 +5,7 @@ import contextlib
 import functools
 import multiprocessing.util
 import sys
+import warnings
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -14,6 +15,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from midway.envs.group import Group
 from midway.envs.reading import Array
+from midway.errors import BrokenEnvironmentError
 
 PATIENCE = 5.0
 """Seconds that a process may take to close its environments before it is killed."""
@@ -68,10 +70,17 @@ class Workers:
         }
 
     def _ask(self, question: Callable[[], Any]) -> Any:
+        """Ask all processes something.
+
+        Raises:
+            BrokenEnvironmentError: An environment raised, or its process has ended.
+        """
         try:
-            return question()
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message=".*ERROR: ")  # tracebacks, in words
+                return question()
         except (EOFError, ConnectionError) as error:
-            raise RuntimeError(
+            raise BrokenEnvironmentError(
                 "a process that steps environments has ended (killed, or out of memory?)"
             ) from error
 

@@ -92,6 +92,7 @@ def _unfinished(runs: Runs) -> Iterator[str]:
             yield f"{group.label}: one seed, so there is no interval over seeds"
         for run in group.runs:
             where = f"{group.label}, seed {run.config.seed}"
+            yield from (f"{where}: left out: {text}" for text in run.damaged)
             if not run.finished:
                 yield f"{where}: unfinished, {run.steps:,} of {run.config.train.steps:,} steps"
             if not run.evaluation:

@@ -17,6 +17,7 @@ from midway.errors import ConfigurationError
 from midway.reports import style
 from midway.runs.folder import RunConfig, RunFolder, read_json, run_name
 from midway.tables import Table
+from midway.training.arrays import checked_arrays
 from midway.types import JsonObject
 
 Row: TypeAlias = dict[str, float]
@@ -26,6 +27,9 @@ WATCHING = ("steps", "evaluate_every", "evaluation_episodes", "log_every", "chec
 """Settings that a run does not learn from."""
 
 
+METRICS = ("step", "updates", "seconds")
+EVALUATION = (*METRICS, "task", "actions", "success_rate", "final_distance")
+"""Columns without which a file cannot be of a run."""
 NAMED_SETTINGS = 3
 """Settings that tell groups of an agent apart in legends, at most."""
 
@@ -40,6 +44,7 @@ class RunData:
         record: All of ``config.json``: versions, commit, machine and command too.
         metrics: Scalars of training; no columns before the first row.
         evaluation: Evaluations; no columns before the first row.
+        damaged: What cannot be read, in words; it is treated as if it were not there.
     """
 
     folder: RunFolder
@@ -47,6 +52,7 @@ class RunData:
     record: JsonObject
     metrics: Table
     evaluation: Table
+    damaged: tuple[str, ...] = ()
 
     @property
     def steps(self) -> int:
@@ -78,8 +84,7 @@ class RunData:
     @property
     def past_weights(self) -> dict[int, Path]:
         """Weights that were kept before the policy was saved, by step."""
-        files = self.folder.past_policies.glob("step-*.safetensors")
-        steps = {int(file.stem.removeprefix("step-")): file for file in files}
+        steps = {step: file for step, file in _kept(self.folder).items() if not _damage(file)}
         return {step: steps[step] for step in sorted(steps) if step < self.policy_step}
 
     @property
@@ -158,18 +163,44 @@ def read(path: Path) -> RunData:
     """Return what is in a run folder.
 
     Raises:
-        ConfigurationError: It is no run folder, or damaged, or of another version.
+        ConfigurationError: It is no run folder, or its configuration is damaged or of another
+            version.
     """
     folder = RunFolder(path)
     config = folder.load_config()
     record = read_json(folder.config_file)
-    return RunData(
-        folder,
-        config,
-        record,
-        tables.read(folder.metrics_file),
-        tables.read(folder.evaluation_file),
-    )
+    metrics, wrong = _table(folder.metrics_file, METRICS)
+    evaluation, wrong_too = _table(folder.evaluation_file, EVALUATION)
+    kept = [_damage(file) for file in _kept(folder).values()]
+    damaged = tuple(text for text in (wrong, wrong_too, *kept) if text)
+    return RunData(folder, config, record, metrics, evaluation, damaged)
+
+
+def _table(path: Path, columns: Sequence[str]) -> tuple[Table, str]:
+    """Return a table and what is wrong with it; no columns then."""
+    try:
+        found = tables.read(path)
+    except ConfigurationError as error:
+        return {}, str(error)
+    missing = [name for name in columns if name not in found]
+    if found and missing:
+        return {}, f"{path} is damaged: it has no columns {', '.join(missing)}"
+    return found, ""
+
+
+def _kept(folder: RunFolder) -> dict[int, Path]:
+    """Return the weights that were kept, by step."""
+    names = {file.stem.removeprefix("step-"): file for file in folder.past_policies.glob("step-*")}
+    return {int(n): f for n, f in names.items() if n.isdigit() and f.suffix == ".safetensors"}
+
+
+def _damage(weights: Path) -> str:
+    """Return what is wrong with a file of weights; nothing if it is whole."""
+    try:
+        checked_arrays(weights)
+    except ConfigurationError as error:
+        return str(error)
+    return ""
 
 
 def row(table: Table, place: int) -> Row:

@@ -93,7 +93,8 @@ class Checkpoints:
         try:
             self.remove_unfinished()
             self._folder.mkdir(exist_ok=True)
-            self._checkpointer.save(unfinished / ARRAYS, args=ocp.args.StandardSave(state))
+            with _quiet(logging.CRITICAL):  # its threads print what is raised here too
+                self._checkpointer.save(unfinished / ARRAYS, args=ocp.args.StandardSave(state))
             self._seal(unfinished, step, spec)
             unfinished.rename(self._folder / str(step))
             for old in self.steps()[:-KEPT]:
@@ -318,11 +319,11 @@ def _remove(folder: Path) -> None:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep Orbax from warning of metadata that earlier versions did not write."""
+def _quiet(least: int = logging.ERROR) -> Iterator[None]:
+    """Keep Orbax from warning of metadata that earlier versions did not write, and the like."""
     logger = logging.getLogger("absl")
     level = logger.level
-    logger.setLevel(logging.ERROR)
+    logger.setLevel(least)
     try:
         yield
     finally:

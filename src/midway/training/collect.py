@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from midway.errors import ConfigurationError
+from midway.errors import BrokenEnvironmentError, ConfigurationError
 from midway.replay.storage import ReplayState
-from midway.training import step
+from midway.training import faults, step
 from midway.training.checkpoint import Stored
-from midway.types import NumPyArray, Observations, VectorGoalEnv
+from midway.types import Info, NumPyArray, Observations, VectorGoalEnv
 
 Actions = Callable[[Observations], NumPyArray]
 
@@ -46,6 +46,8 @@ class Collector:
             for never.
         logged: Sum and number over the steps since then of each info that the environment wants
             logged, by its name in ``metrics.csv``.
+        moved: Whether the last step was taken; not if an environment raised in it.
+        fault: What was wrong with an environment in the last step.
     """
 
     env: VectorGoalEnv
@@ -54,6 +56,8 @@ class Collector:
     counts: EpisodeCounts = field(default_factory=EpisodeCounts)
     limit: int = 0
     logged: dict[str, NumPyArray] = field(default_factory=dict)
+    moved: bool = True
+    fault: BrokenEnvironmentError | None = None
 
     def __post_init__(self) -> None:
         """Begin the sums that are not given."""
@@ -70,25 +74,46 @@ class Collector:
         return collector, step.begin(replay, observation, everyone)
 
     def step(self, replay: ReplayState, choose: Actions) -> ReplayState:
-        """Take one step in every environment; begin new episodes where one has ended."""
+        """Take one step in every environment; begin new episodes where one has ended.
+
+        A step in which an environment raises is not taken. One that shows what is not finite is
+        not stored in its environment, where a new episode begins. Both are noted as ``fault``.
+        """
         actions = choose(self.observation)
-        self.observation, _, terminated, truncated, info = self.env.step(actions)
+        self.moved, self.fault = True, None
+        try:
+            observation, _, terminated, truncated, info = self.env.step(actions)
+        except BrokenEnvironmentError as error:
+            self.moved, self.fault = False, error
+            return replay
+        sound = faults.finite(observation)
+        if not sound.all():
+            self.fault = faults.not_finite(self.env, sound, info, actions)
+        self.observation = observation
         for name, column in self.env.logged_info.items():
-            self.logged[column] += (info[name].sum(), self.env.num_envs)
-        everyone = np.ones(self.env.num_envs, np.bool_)
+            self.logged[column] += (info[name][sound].sum(), int(sound.sum()))
         failed = {"failed": info["failed"]} if "failed" in info else {}
-        replay = step.add(replay, actions, self.observation | failed, everyone)
+        replay = step.add(replay, actions, self.observation | failed, sound)
         ended = terminated | truncated
         if self.limit:
             ended = ended | (info["elapsed_steps"] >= self.limit)
-        if ended.any():
-            self.counts.episodes += int(ended.sum())
-            self.counts.successes += int((info["is_success"] & ended).sum())
-            self.counts.length += int(info["elapsed_steps"][ended].sum())
-            self.observation, _ = self.env.reset(options={"reset_mask": ended})
-            replay = step.begin(replay, self.observation, ended)
-        self.begun = ended
-        return replay
+        self._count(ended & sound, info)
+        self.begun = ended | ~sound
+        return self._begin(replay) if self.begun.any() else replay
+
+    def _count(self, ended: NumPyArray, info: Info) -> None:
+        self.counts.episodes += int(ended.sum())
+        self.counts.successes += int((info["is_success"] & ended).sum())
+        self.counts.length += int(info["elapsed_steps"][ended].sum())
+
+    def _begin(self, replay: ReplayState) -> ReplayState:
+        """Begin the episodes of ``begun``; where that fails, a resumed run begins all anew."""
+        try:
+            self.observation, _ = self.env.reset(options={"reset_mask": self.begun})
+        except BrokenEnvironmentError as error:
+            self.fault = error
+            return replay
+        return step.begin(replay, self.observation, self.begun)
 
     def take_metrics(self) -> dict[str, float]:
         """Return means since the last call, NaN where there are none; then start anew."""

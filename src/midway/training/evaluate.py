@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from midway.training import faults
 from midway.types import AnyArray, Info, NumPyArray, Observations, VectorGoalEnv
 
 ActionKind: TypeAlias = Literal["mean", "sampled"]
@@ -94,12 +95,17 @@ def rollout(env: VectorGoalEnv, actor: Policy, observation: Observations) -> Ite
         env: A vector environment without autoreset, just reset.
         actor: The policy; it is told of episodes that are over if it has a method ``rest``.
         observation: The observations of the reset.
+
+    Raises:
+        BrokenEnvironmentError: An environment raises, or shows what is not finite.
     """
     running = np.ones(env.num_envs, np.bool_)
     rest = getattr(actor, "rest", lambda done: None)
     while running.any():
         action = np.asarray(actor(observation["observation"], observation["desired_goal"]))
         observation, _, terminated, truncated, info = env.step(action)
+        if not (sound := faults.finite(observation) | ~running).all():
+            raise faults.not_finite(env, sound, info, action)
         over = terminated | truncated
         yield Moment(observation, info, running.copy(), over & running, info["is_success"])
         running &= ~over
@@ -109,7 +115,12 @@ def rollout(env: VectorGoalEnv, actor: Policy, observation: Observations) -> Ite
 
 
 def run_episodes(
-    env: VectorGoalEnv, policy: Policy, task: str, actions: ActionKind, seed: int
+    env: VectorGoalEnv,
+    policy: Policy,
+    task: str,
+    actions: ActionKind,
+    seed: int,
+    check: Callable[[], None] = lambda: None,
 ) -> Evaluation:
     """Run one episode in each environment.
 
@@ -119,10 +130,12 @@ def run_episodes(
         task: Distribution of starts and goals.
         actions: ``mean`` or ``sampled``, for the record.
         seed: The same seed gives the same starts and goals.
+        check: Is called after every step; what it raises ends the episodes.
     """
     observation, _ = env.reset(seed=seed, options={"task": task})
     episodes: dict[int, Episode] = {}
     for moment in rollout(env, policy, observation):
+        check()
         for number in map(int, np.flatnonzero(moment.ended)):
             episodes[number] = Episode(
                 success=bool(moment.success[number]),

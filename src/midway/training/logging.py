@@ -1,13 +1,12 @@
 """The numbers of a run, into CSV files and TensorBoard."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-
-from tensorboardX import SummaryWriter
 
 from midway.tables import Appender
 from midway.training.evaluate import Evaluation
+from midway.training.events import Events
 
 EVALUATION_COLUMNS = (
     "step",
@@ -31,19 +30,30 @@ class Logger:
         evaluation: ``evaluation.csv``.
         events: Folder of TensorBoard event files.
         until: Step that the run continues from; later rows of the files are dropped.
+        say: Is told when events cannot be written.
+
+    Raises:
+        OSError: The CSV files cannot be written.
+        ConfigurationError: They hold something else.
     """
 
-    def __init__(self, metrics: Path, evaluation: Path, events: Path, until: int) -> None:
+    def __init__(
+        self,
+        metrics: Path,
+        evaluation: Path,
+        events: Path,
+        until: int,
+        say: Callable[[str], None],
+    ) -> None:
         self._metrics = Appender(metrics, until)
         self._evaluation = Appender(evaluation, until)
-        self._events = SummaryWriter(str(events), purge_step=until + 1 if until else None)
+        self._events = Events(events, until, say)
 
     def metrics(self, step: int, values: Mapping[str, int | float]) -> None:
         """Write one row of scalars; a value that is not a number is left out."""
         known = {name: value for name, value in values.items() if not math.isnan(value)}
         self._metrics.write({"step": step, **dict.fromkeys(values, ""), **known})
-        for name, value in known.items():
-            self._events.add_scalar(name, value, step)
+        self._events.scalars(step, known)
 
     def evaluation(self, step: int, clock: Mapping[str, int | float], result: Evaluation) -> None:
         """Write one row for an evaluated task and kind of action."""
@@ -57,8 +67,8 @@ class Logger:
         row = {"step": step, **clock, **row, **values}
         columns = dict.fromkeys([*EVALUATION_COLUMNS, *values])
         self._evaluation.write({column: row[column] for column in columns})
-        for name, value in values.items():
-            self._events.add_scalar(f"eval/{result.task}/{result.actions}/{name}", value, step)
+        prefix = f"eval/{result.task}/{result.actions}"
+        self._events.scalars(step, {f"{prefix}/{name}": value for name, value in values.items()})
 
     def close(self) -> None:
         """Put everything on disk."""

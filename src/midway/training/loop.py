@@ -4,23 +4,20 @@ Every random draw comes from the seed and a counter
 of steps or updates, so that the counters are all there is to restore.
 """
 
-import signal
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
-from types import FrameType
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import jax
 import numpy as np
 
-from midway.errors import NonFiniteError
+from midway.errors import BrokenEnvironmentError, NonFiniteError
 from midway.training import acting
 from midway.training.arrays import named_arrays
 from midway.training.compilation import give_back_memory
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
+from midway.training.signals import Asked, Interrupted
 from midway.training.state import Counters, Training, freeze_encoder
 from midway.types import NumPyArray, Observations
 
@@ -65,6 +62,8 @@ def advance(training: Training) -> None:
     if train.collect:
         choose = partial(_choose, training)
         training.replay = training.collector.step(training.replay, choose)
+        if not training.collector.moved:
+            return
     if (begun := training.collector.begun).any():
         fresh = training.begin_episodes(train.num_envs)
         training.memory = acting.renew(training.memory, fresh, begun)
@@ -91,6 +90,8 @@ def _choose(training: Training, observation: Observations) -> NumPyArray:
     key = jax.random.fold_in(streams.act_key, steps)
     pair = observation["observation"], observation["desired_goal"]
     actions, training.memory = training.program.act(training.arrays, training.memory, *pair, key)
+    if not np.isfinite(actions).all():
+        raise NonFiniteError(f"the policy's actions are not finite after step {steps}")
     return np.asarray(actions)
 
 
@@ -116,15 +117,21 @@ def metrics(training: Training) -> dict[str, float]:
     return values | training.collector.take_metrics()
 
 
-def evaluate(training: Training) -> Iterator[Evaluation]:
-    """Yield the evaluations of the current policy, on environments of their own."""
+def evaluate(training: Training, asked: Asked) -> Iterator[Evaluation]:
+    """Yield the evaluations of the current policy, on environments of their own.
+
+    Raises:
+        Interrupted: The run shall end.
+        BrokenEnvironmentError: An environment cannot go on.
+    """
     envs = training.evaluation_envs
     for task in [task for task in EVALUATED_TASKS if task in training.collector.env.tasks]:
         if task not in envs:
             envs[task] = training.make_env(training.setup.train.evaluation_episodes, task)
         for actions in EVALUATED_ACTIONS:
             seed = training.streams.evaluation
-            yield run_episodes(envs[task], policy(training, actions), task, actions, seed)
+            actor = policy(training, actions)
+            yield run_episodes(envs[task], actor, task, actions, seed, asked.check)
 
 
 def policy(training: Training, actions: ActionKind) -> acting.Actor:
@@ -149,46 +156,94 @@ def check_finite(training: Training) -> None:
 # --- the loop -------------------------------------------------------------------------------------
 
 
-def run(training: Training, sinks: Sinks) -> bool:
-    """Train until the configured number of steps; return whether it was reached.
+def run(training: Training, sinks: Sinks, asked: Asked | None = None) -> bool:
+    """Train until the configured number of steps; return whether all of it is done.
 
-    An interrupt (Ctrl-C, or the signal to terminate) ends the run with a checkpoint.
+    What a signal interrupted in an earlier process is done first.
+
+    Args:
+        training: The run.
+        sinks: Where its rows, evaluations, snapshots and checkpoints go.
+        asked: What signals ask for: a checkpoint, or to end with one.
 
     Raises:
         NonFiniteError: A loss or a network is not finite; the last good checkpoint is kept.
+        BrokenEnvironmentError: An environment cannot go on; a checkpoint is written before.
     """
-    train = training.setup.train
+    train, asked = training.setup.train, asked or Asked()
     started = time.perf_counter() - training.counters.seconds
     success: dict[str, float] = {}
+    evaluated = True
 
     def tick() -> None:
         seconds = time.perf_counter() - started
         training.counters = training.counters._replace(seconds=seconds)
 
-    with _interruptible() as interrupted:
-        while training.counters.steps < train.steps and not interrupted.is_set():
-            before = training.counters.steps
-            advance(training)
-            now = training.counters.steps
-
-            def every(count: int, before: int = before, now: int = now) -> bool:
-                return now >= train.steps or now // count > before // count
-
+    _stop_at_fault(training, sinks)
+    while training.counters.steps < train.steps and asked.end is None:
+        advance(training)
+        if training.collector.moved:
             tick()
-            if every(train.log_every):
+            if is_due(training, train.log_every):
                 _log(training, sinks, success)
-            if every(train.evaluate_every):
-                success = note_evaluation(training, sinks)
-            if every(max(1, train.steps // SNAPSHOTS)):
+            if is_due(training, train.evaluate_every):
+                evaluated = take_evaluation(training, sinks, success, asked)
+            if is_due(training, max(1, train.steps // SNAPSHOTS)):
                 sinks.snapshot(training)
             tick()
-            if every(train.checkpoint_every):
+            if is_due(training, train.checkpoint_every) or asked.save:
                 sinks.checkpoint(training)
-    finished = training.counters.steps >= train.steps
+            _obey(training, sinks, asked)
+        _stop_at_fault(training, sinks)
+    finished = training.counters.steps >= train.steps and evaluated
     if not finished:
         sinks.checkpoint(training)
         sinks.message(f"interrupted: checkpoint of step {training.counters.steps} written")
     return finished
+
+
+def is_due(training: Training, every: int) -> bool:
+    """Return whether the newest step is the last one, or has passed a multiple of ``every``."""
+    train, now = training.setup.train, training.counters.steps
+    return now >= train.steps or now // every > (now - train.num_envs) // every
+
+
+def take_evaluation(
+    training: Training, sinks: Sinks, success: dict[str, float], asked: Asked
+) -> bool:
+    """Evaluate, unless the run shall end; return whether it may go on.
+
+    An environment that cannot go on stops the run only at its last step.
+    """
+    steps = training.counters.steps
+    try:
+        success.update(note_evaluation(training, sinks, asked))
+    except Interrupted:
+        return False
+    except BrokenEnvironmentError as fault:
+        training.evaluation_envs.clear()
+        sinks.message(f"evaluation of step {steps} is left out: {fault}")
+        if steps >= training.setup.train.steps:
+            training.collector.fault = fault
+    return True
+
+
+def _obey(training: Training, sinks: Sinks, asked: Asked) -> None:
+    """Say that the checkpoint that a signal asked for is written."""
+    if asked.save:
+        asked.save = False
+        sinks.message(f"checkpoint of step {training.counters.steps} written")
+
+
+def _stop_at_fault(training: Training, sinks: Sinks) -> None:
+    """Write a checkpoint and stop, if an environment cannot go on.
+
+    Raises:
+        BrokenEnvironmentError: It cannot.
+    """
+    if (fault := training.collector.fault) is not None:
+        sinks.checkpoint(training)
+        raise fault
 
 
 def _clock(counters: Counters) -> Clock:
@@ -213,36 +268,19 @@ def _log(training: Training, sinks: Sinks, success: dict[str, float]) -> None:
     sinks.progress(counters.steps, {"steps/s": speed, **success})
 
 
-def note_evaluation(training: Training, sinks: Sinks) -> dict[str, float]:
-    """Evaluate, write a row for each task and kind of action, and return success by task."""
+def note_evaluation(
+    training: Training, sinks: Sinks, asked: Asked | None = None
+) -> dict[str, float]:
+    """Evaluate, write a row for each task and kind of action, and return success by task.
+
+    Raises:
+        Interrupted: The run shall end; nothing is written then.
+        BrokenEnvironmentError: An environment cannot go on; nothing is written then.
+    """
     counters, success = training.counters, {}
-    for result in evaluate(training):
+    for result in list(evaluate(training, asked or Asked())):
         sinks.evaluation(counters.steps, _clock(counters), result)
         if result.actions == "mean":
             success[f"success/{result.task}"] = result.success_rate
     sinks.progress(counters.steps, success)
     return success
-
-
-@contextmanager
-def _interruptible() -> Iterator[threading.Event]:
-    """Turn the first interrupt into an event; the second one interrupts at once."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    names = (signal.SIGINT, signal.SIGTERM)
-    previous = {name: signal.getsignal(name) for name in names}
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        event.set()
-        for name in names:
-            signal.signal(name, previous[name])
-
-    for name in names:
-        signal.signal(name, handle)
-    try:
-        yield event
-    finally:
-        for name in names:
-            signal.signal(name, previous[name])

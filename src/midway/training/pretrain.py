@@ -21,6 +21,7 @@ MakeEnv: TypeAlias = Callable[[int, str], VectorGoalEnv]
 """``(number of environments, task) -> vector environment``."""
 
 Say: TypeAlias = Callable[[str], None]
+Check: TypeAlias = Callable[[], None]
 AnyPretrain: TypeAlias = Pretrain[Any, Any]
 
 NUM_ENVS = 100
@@ -31,7 +32,13 @@ MESSAGES = 10
 
 
 def run(
-    ability: AnyPretrain, state: AgentState, make_env: MakeEnv, seed: int, folder: Path, say: Say
+    ability: AnyPretrain,
+    state: AgentState,
+    make_env: MakeEnv,
+    seed: int,
+    folder: Path,
+    say: Say,
+    check: Check = lambda: None,
 ) -> AgentState:
     """Return the agent's state after its pre-training.
 
@@ -44,6 +51,7 @@ def run(
         seed: Seed of the run.
         folder: The run folder.
         say: Is told how far it is.
+        check: Is called after every step and round; what it raises ends the pre-training.
 
     Raises:
         ConfigurationError: Networks of another run shall be used and cannot be.
@@ -54,19 +62,22 @@ def run(
         state = load(state, settings.networks, Path(settings.source))
     else:
         env_seed, key = seeds.pretraining(seed)
-        states = sample_states(make_env(NUM_ENVS, "uniform"), settings, env_seed)
-        state = train(ability, state, states, key, folder, say)
+        states = sample_states(make_env(NUM_ENVS, "uniform"), settings, env_seed, check)
+        state = train(ability, state, states, key, folder, say, check)
     save_arrays(_file(folder), networks_of(state, settings.networks))
     return state
 
 
-def sample_states(env: VectorGoalEnv, settings: PretrainSettings, seed: int) -> Subgoal:
+def sample_states(
+    env: VectorGoalEnv, settings: PretrainSettings, seed: int, check: Check = lambda: None
+) -> Subgoal:
     """Return states ``(N, ...)``: those of resets, and those after each of a few random actions.
 
     Args:
         env: A vector environment.
         settings: How many states and random actions.
         seed: Seed of resets and actions.
+        check: Is called after every step.
     """
     generator = np.random.default_rng(seed)
     shape = (env.num_envs, env.goal_spec.action_dim)
@@ -74,6 +85,7 @@ def sample_states(env: VectorGoalEnv, settings: PretrainSettings, seed: int) -> 
     while len(found) * env.num_envs < settings.states:
         for _ in range(settings.random_actions):
             actions = generator.uniform(-1, 1, shape).astype(np.float32)
+            check()
             observation, _, terminated, truncated, _ = env.step(actions)
             found.append(observation)
             if (ended := terminated | truncated).any():
@@ -93,12 +105,14 @@ def train(
     key: Key[Array, ""],
     folder: Path,
     say: Say,
+    check: Check = lambda: None,
 ) -> AgentState:
     """Return the agent's state after all rounds; each is one row of ``pretraining.csv``."""
     table = Appender(folder / "pretraining.csv", until=0)
     one_round = eqx.filter_jit(ability.round)
     rounds = ability.settings(state.config).rounds
     for number in range(1, rounds + 1):
+        check()
         state, metrics = one_round(state, states, jax.random.fold_in(key, number))
         values = {name: float(value) for name, value in metrics.items()}
         for name, value in values.items():

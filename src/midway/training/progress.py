@@ -14,6 +14,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from midway.training.terminal import heard, print_line
+
 
 @runtime_checkable
 class Reporter(Protocol):
@@ -57,7 +59,7 @@ class Lines:
 
     def message(self, text: str) -> None:
         """Print one line."""
-        print(text, file=sys.stderr, flush=True)
+        print_line(text)
 
     def advance(self, step: int, values: Mapping[str, float]) -> None:
         """Print one line of progress."""
@@ -89,15 +91,18 @@ class Bar:
 
     def message(self, text: str) -> None:
         """Print one line above the bar."""
-        self._progress.console.print(text, markup=False, highlight=False)
+        with heard():
+            self._progress.console.print(text, markup=False, highlight=False)
 
     def advance(self, step: int, values: Mapping[str, float]) -> None:
         """Move the bar."""
-        self._progress.update(self._task, completed=step, values=_describe(values))
+        with heard():
+            self._progress.update(self._task, completed=step, values=_describe(values))
 
     def close(self) -> None:
         """Leave the bar as it is."""
-        self._progress.stop()
+        with heard():
+            self._progress.stop()
 
 
 def reporter(total: int, done: int) -> Reporter:

@@ -14,13 +14,13 @@ from midway.agent import AgentState, AnyAgent, Encoder, Memory
 from midway.errors import ConfigurationError
 from midway.replay import buffer
 from midway.replay.storage import ReplayState
-from midway.training import acting, demonstrations, freeze, pretrain, seeds, step
+from midway.training import acting, demonstrations, freeze, memory, pretrain, seeds, step
 from midway.training.arrays import named_arrays, with_named_arrays
 from midway.training.checkpoint import Checkpoints, Stored
 from midway.training.collect import Collector
 from midway.training.config import TrainConfig
 from midway.training.devices import Devices
-from midway.training.pretrain import MakeEnv, Say
+from midway.training.pretrain import Check, MakeEnv, Say
 from midway.training.step import Arrays, Program
 from midway.types import EnvSpec, Hyperparameters, Metrics, Trajectory, VectorGoalEnv
 
@@ -127,28 +127,31 @@ def check(setup: Setup) -> None:
 
     Raises:
         ConfigurationError: A lane of the replay is too small, the agent cannot learn from this
-            environment, or the machine has fewer devices.
+            environment, the machine has fewer devices, or too little memory for replay, networks
+            and optimisers.
     """
     spec, train = setup.make_env(1, setup.train.task).goal_spec, setup.train
-    buffer.memory_bytes(spec, train.replay_capacity, train.num_envs)
+    replay = buffer.memory_bytes(spec, train.replay_capacity, train.num_envs)
     _devices(setup)
     key = seeds.training(setup.seed).network_key
-    eqx.filter_eval_shape(setup.agent.create, setup.hyperparameters, spec, key)
+    state = eqx.filter_eval_shape(setup.agent.create, setup.hyperparameters, spec, key)
+    memory.check({"replay": replay, "networks and optimisers": memory.of_state(state)})
 
 
-def start(setup: Setup, say: Say | None = None) -> Training:
+def start(setup: Setup, say: Say | None = None, check: Check = lambda: None) -> Training:
     """Return a run before its first step.
 
     Args:
         setup: What it is made of.
         say: Is told of pre-training; None to leave the agent's pre-training out, as for a run that
             is about to be restored.
+        check: Is called during pre-training; what it raises ends it.
     """
     agent, env = setup.agent, setup.make_env(setup.train.num_envs, setup.train.task)
     started = time.perf_counter()
     state = _create(setup, env.goal_spec)
     if agent.pretrain and say is not None:
-        arguments = (setup.make_env, setup.seed, setup.folder, say)
+        arguments = (setup.make_env, setup.seed, setup.folder, say, check)
         state = pretrain.run(agent.pretrain, state, *arguments)
     seconds = time.perf_counter() - started if agent.pretrain and say is not None else 0.0
     encoder = None

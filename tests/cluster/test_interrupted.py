@@ -1,0 +1,48 @@
+"""A sweep that is interrupted lets its runs write their checkpoints, and goes on from them."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from midway.cluster.jobs import Processes
+from midway.training.checkpoint import steps_in
+
+LONG = ["hidden=(8,)", "batch_size=8", "num_envs=4", "random_steps=16", "replay_capacity=2000"]
+LONG += ["evaluate_every=10_000_000", "log_every=40", "checkpoint_every=10_000_000"]
+
+
+def test_an_interrupted_sweep_leaves_checkpoints(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "midway.cli", "sweep", "point-u", "--agents", "sac"]
+    words += ["--seeds", "0", "1", "--steps", "9_000_000", "--out", str(tmp_path), "--set", *LONG]
+    sweep = subprocess.Popen(words, stderr=subprocess.PIPE, process_group=0, text=True)
+    logs = [tmp_path / f"point-u-sac-seed{seed}.log" for seed in (0, 1)]
+    running = logs[: len(os.sched_getaffinity(0))]
+    limit = time.monotonic() + 120
+    while not all(log.exists() and "step " in log.read_text() for log in running):
+        assert time.monotonic() < limit
+        assert sweep.poll() is None
+        time.sleep(0.2)
+    os.killpg(sweep.pid, signal.SIGINT)  # as a terminal does
+    _, said = sweep.communicate(timeout=60)
+    assert sweep.returncode == 130
+    assert "type the same command again" in said
+    for log in running:
+        assert log.read_text().count("interrupted: checkpoint") == 1
+        assert steps_in(log.with_suffix("") / "checkpoints")
+
+
+def test_processes_are_asked_once_and_no_other_is_started(tmp_path: Path) -> None:
+    processes, log = Processes(), tmp_path / "log"
+    processes.end()
+    assert processes.run(["true"], log) == 128 + signal.SIGTERM
+    assert log.read_text() == ""
+
+
+@pytest.mark.parametrize("status", [0, 3])
+def test_the_status_of_a_process_is_returned(tmp_path: Path, status: int) -> None:
+    assert Processes().run(["sh", "-c", f"exit {status}"], tmp_path / "log") == status

@@ -1,0 +1,83 @@
+"""Environments of others that raise, or show what they did not declare, stop a run by name."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import midway
+from midway.errors import BrokenEnvironmentError
+from midway.training.checkpoint import steps_in
+
+TINY: dict[str, object] = {
+    "hidden": (8,),
+    "batch_size": 8,
+    "num_envs": 2,
+    "random_steps": 20,
+    "replay_capacity": 400,
+    "evaluate_every": 1_000,
+    "evaluation_episodes": 1,
+    "log_every": 20,
+    "checkpoint_every": 1_000,
+    "steps": 80,
+}
+
+
+class Line(gymnasium.Env[Any, Any]):
+    """A point on a line, which breaks once this many steps were taken by all of its kind."""
+
+    breaks_after = 10**9
+    how = "raise"
+    taken = 0
+
+    def __init__(self) -> None:
+        box = spaces.Box(-10, 10, (1,), np.float64)
+        names = ("observation", "achieved_goal", "desired_goal")
+        self.observation_space = spaces.Dict(dict.fromkeys(names, box))
+        self.action_space = spaces.Box(-1, 1, (1,), np.float32)
+        self.spec = None
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.x, self.goal = np.zeros(1), self.np_random.uniform(-1, 1, 1)
+        return self._shown(), {}
+
+    def step(self, action: Any) -> Any:
+        Line.taken += 1
+        self.x = np.clip(self.x + 0.2 * np.asarray(action, np.float64), -10, 10)
+        if Line.taken > Line.breaks_after:
+            if Line.how == "raise":
+                raise ValueError("the\nsimulator is tired")
+            self.x = np.zeros(3) if Line.how == "shape" else np.array([np.nan])
+        return self._shown(), 0.0, False, False, {}
+
+    def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+        return -1.0 * (np.linalg.norm(achieved - desired, axis=-1) > 0.2)
+
+    def _shown(self) -> dict[str, Any]:
+        return {"observation": self.x, "achieved_goal": self.x, "desired_goal": self.goal}
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [("raise", "ValueError: the"), ("shape", "ValueError"), ("nan", "is not finite")],
+)
+def test_a_broken_environment_stops_the_run_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str, said: str
+) -> None:
+    env = midway.goal_env(Line, max_episode_steps=20, success_distance=0.2)
+    monkeypatch.setattr(Line, "how", how)
+    monkeypatch.setattr(Line, "breaks_after", Line.taken + 51)
+    with pytest.raises(BrokenEnvironmentError) as error:
+        midway.train(env, agent="sac", out=tmp_path / "run", changes=TINY)
+    text = str(error.value)
+    assert said in text
+    assert "environment 1" in text
+    assert re.search(r"in step \d+ of its episode", text)
+    assert "action [" in text
+    assert "midway resume" in text
+    assert max(steps_in(tmp_path / "run" / "checkpoints")) == 50
