@@ -99,7 +99,6 @@ def test_same_seed_same_run_and_other_seed_another(whole_run: Path, tmp_path: Pa
     assert rows(whole_run / "metrics.csv") != rows(tmp_path / "other" / "metrics.csv")
 
 
-@pytest.mark.parametrize("whole_run", ["sac"], indirect=True)
 def test_killed_run_resumes_from_its_newest_whole_checkpoint(
     whole_run: Path, tmp_path: Path
 ) -> None:
