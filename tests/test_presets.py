@@ -92,7 +92,7 @@ def test_values_are_those_of_the_presets_before(key: str) -> None:
         assert differ == INTENDED.get(key, {})
 
 
-NEW = {"collect_limit": 0, "normalise": False, **vars(beyond.SubgoalSettings())}
+NEW = {"collect": True, "collect_limit": 0, "normalise": False, **vars(beyond.SubgoalSettings())}
 """Settings that there were none of, with the values that stand for that."""
 
 FASTER = {

@@ -12,9 +12,9 @@ import pytest
 from drawing_here import needs_renderer
 from midway import api
 from midway.cli.main import main
-from midway.envs.registry import make_vec
+from midway.envs.registry import Declaration, make_vec
 from midway.errors import ConfigurationError
-from midway.reports import decoder, images, recordings, report, tabletop, videos, watch
+from midway.reports import decoder, images, report, tabletop, videos, watch
 from midway.reports.recordings import Recording
 from midway.reports.scenes import TableScene, Words
 from midway.runs.folder import RunFolder
@@ -62,7 +62,7 @@ def test_without_a_drawing_library_images_are_missing_and_the_rest_is_drawn(
     def fail(*arguments, **options):
         raise ConfigurationError("images need OpenGL")
 
-    monkeypatch.setattr(recordings.environments, "make_vec", fail)
+    monkeypatch.setattr(Declaration, "factory", fail)
     page, *figures = report([image_run], tmp_path)
     assert stems(figures) == {"push-learning-curves", "push-distances"}
     assert "images need OpenGL" in page.read_text()

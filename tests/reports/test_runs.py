@@ -72,14 +72,6 @@ def test_a_foreign_folder_is_one_line(tmp_path, ris_run):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_damaged_table_is_one_line(tmp_path, ris_run, copy_run):
-    damaged = copy_run(ris_run, "damaged")
-    (damaged / "metrics.csv").write_text("step,loss\n1,loss\n")
-    with pytest.raises(ConfigurationError, match=r"metrics\.csv cannot be read") as error:
-        report([damaged], tmp_path / "out")
-    assert "\n" not in str(error.value)
-
-
 def test_no_folder_and_an_unwritable_place_are_errors(tmp_path, ris_run):
     with pytest.raises(ConfigurationError, match="no run folder"):
         report([])

@@ -16,7 +16,7 @@ import midway
 from midway.api import Run
 from midway.cli.main import main
 from midway.errors import BrokenEnvironmentError, NonFiniteObservationError
-from midway.training import loop
+from midway.training import loop, signals
 from midway.training.checkpoint import steps_in
 from midway.training.events import Events
 from midway.training.state import Training
@@ -154,6 +154,8 @@ def test_signals_end_a_run_with_a_checkpoint_and_their_status(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     run = tmp_path / "run"
+    # Under nohup the tests themselves ignore SIGHUP, and a run then does too.
+    monkeypatch.setattr(signals, "_is_ignored", lambda number: False)
     with monkeypatch.context() as patch:
         signal_at(patch, "advance", number, lambda training: training.counters.steps == 68)
         with pytest.raises(SystemExit) as stop:
