@@ -42,7 +42,7 @@ def train(
 
     Args:
         env: Environment name (see `midway envs`), a Gymnasium id, module:Id or module:callable.
-        agent: ris, sac, tdm or leap, or PACKAGE.MODULE:NAME for an agent of your own.
+        agent: ris, sac, crl, tdm or leap, or PACKAGE.MODULE:NAME for an agent of your own.
         preset: paper (table 1), quick (two cores), or a file ending in .toml.
         steps: Environment steps; default: the preset's.
         seed: The one seed of every generator.
