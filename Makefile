@@ -22,7 +22,7 @@ $(VENV)/installed: pyproject.toml
 	touch $@
 
 $(VENV)/installed-extras: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --editable '.[dev,cluster,data,robotics]'
+	$(BIN)/python -m pip install --quiet --editable '.[dev,cluster,data,onnx,robotics]'
 	touch $@
 
 # Typed again, it continues where it was stopped.

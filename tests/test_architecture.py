@@ -23,6 +23,7 @@ FLOORS = (
     {"agents"},
     {"training"},
     {"runs", "presets"},
+    {"configuration"},
     {"api"},
     {"reports", "cluster", "bench"},
     {"cli"},

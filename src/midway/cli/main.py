@@ -1,7 +1,7 @@
 """The command line: wires and prints."""
 
 import dataclasses
-import json
+import importlib.metadata
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from midway.cli.about import NOTHING, AboutEnv
-from midway.cli.parsing import Count, OptionalCount, parse, plain, settings
+from midway.cli.lists import doctor, envs, presets, runs
+from midway.cli.parsing import Count, OptionalCount, parse, print_json, settings
+from midway.cli.saved import export, pull, push
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
 from midway.training.terminal import print_line
 
@@ -35,10 +37,15 @@ def train(
     out: Path | None = None,
     precision: Literal["f32", "bf16"] | None = None,
     data: str | None = None,
+    stop_at: float | None = None,
+    overwrite: bool = False,
+    wandb: str | None = None,
     set: tuple[str, ...] = (),
     about: AboutEnv = NOTHING,
 ) -> None:
     """Train an agent on an environment and write a run folder.
+
+    Every setting with its value and source: midway presets ENV AGENT --preset PRESET
 
     Args:
         env: Environment name (see `midway envs`), a Gymnasium id, module:Id or module:callable.
@@ -51,13 +58,22 @@ def train(
         precision: Matrix products in float32 or bfloat16; default: the preset's.
         data: Minari dataset (name or folder) that the replay begins with; with --set collect=False
             nothing else is learned from.
+        stop_at: Success of the task that is shown (hard, if there is one) that ends the run once
+            three evaluations in a row have reached it, such as 0.95.
+        overwrite: Delete the run that is in the folder, unless another process trains it.
+        wandb: Project of Weights & Biases that is shown the run too.
         set: Other settings of the preset, as NAME=VALUE.
         about: What midway must be told of an environment that is not its own.
     """
     from midway import api
+    from midway.envs import registry as environments
+    from midway.runs.folder import run_name
+    from midway.runs.tracking import watching
 
+    declared = environments.entry(about.env(env))
+    out = out or Path("runs") / run_name(declared.name, agent, seed)
     run = api.train(
-        about.env(env),
+        declared,
         agent=agent,
         preset=preset,
         steps=steps,
@@ -68,6 +84,9 @@ def train(
         data=data,
         changes=settings(set),
         progress=True,
+        stop_at=stop_at,
+        callbacks=watching(wandb),
+        overwrite=overwrite,
     )
     _say_where(run)
 
@@ -100,6 +119,8 @@ def resume(
     steps: OptionalCount = None,
     devices: OptionalCount = None,
     from_: Annotated[OptionalCount, arg(name="from")] = None,
+    stop_at: float | None = None,
+    wandb: str | None = None,
 ) -> None:
     """Continue a run from its newest checkpoint.
 
@@ -108,10 +129,14 @@ def resume(
         steps: New total of environment steps; default: the run's own.
         devices: New number of accelerators; default: the run's own.
         from_: Step of the checkpoint, 0 to start anew; later ones are renamed and kept.
+        stop_at: New success that ends the run; 0: none.
+        wandb: Project of Weights & Biases that is shown the run too.
     """
     from midway import api
+    from midway.runs.tracking import watching
 
-    _say_where(api.resume(run, steps=steps, devices=devices, progress=True, from_step=from_))
+    watched = {"progress": True, "stop_at": stop_at, "callbacks": watching(wandb)}
+    _say_where(api.resume(run, steps, devices=devices, from_step=from_, **watched))
 
 
 def evaluate(
@@ -137,7 +162,7 @@ def evaluate(
     result = api.evaluate(run, episodes=episodes, task=task, actions=actions, seed=seed)
     if json:
         episodes_json = [dataclasses.asdict(episode) for episode in result.episodes]
-        _print_json(
+        print_json(
             {
                 "run": str(run),
                 "task": result.task,
@@ -288,84 +313,11 @@ def bench(
     of = {"env": env, "agent": agent, "batch": batch, "precision": precision, "num_envs": num_envs}
     results = {name: piece() for name, piece in chosen.items()}
     if json:
-        _print_json({"machine": measure.machine(), "settings": of, **results})
+        print_json({"machine": measure.machine(), "settings": of, **results})
         return
     print(", ".join(f"{name} {value}" for name, value in {**measure.machine(), **of}.items()))
     for name, figures in results.items():
         print(f"{name:8}" + "  ".join(f"{key} {value:.4g}" for key, value in figures.items()))
-
-
-def envs(json: bool = False) -> None:
-    """List the environments and their tasks.
-
-    Args:
-        json: Print one JSON object.
-    """
-    from midway.envs.registry import ENVIRONMENTS
-
-    if json:
-        entries = {
-            name: {"id": e.gym_id, "tasks": list(e.tasks), "description": e.description}
-            for name, e in ENVIRONMENTS.items()
-        }
-        _print_json(entries)
-        return
-    for name, entry in ENVIRONMENTS.items():
-        print(f"{name:12} {entry.gym_id:26} {entry.description}")
-        print(f"{'':12} tasks: {', '.join(entry.tasks)}")
-
-
-def doctor(json: bool = False) -> None:
-    """Say what this machine has and what is missing.
-
-    Args:
-        json: Print one JSON object.
-    """
-    from midway.cli.doctor import checks
-
-    results = checks()
-    if json:
-        _print_json({check.name: dataclasses.asdict(check) for check in results})
-    else:
-        for check in results:
-            print(f"{'ok     ' if check.ok else 'MISSING'} {check.name:12} {check.detail}")
-    if not all(check.ok for check in results if check.needed):
-        sys.exit(EXIT_FAILED)
-
-
-def presets(
-    env: Positional[str] = "ant-u",
-    agent: Positional[str] = "ris",
-    preset: str = "quick",
-    set: tuple[str, ...] = (),
-    json: bool = False,
-) -> None:
-    """Print every setting of a preset with its value and where that comes from.
-
-    Args:
-        env: Environment name.
-        agent: Agent name.
-        preset: paper, quick, or a file ending in .toml.
-        set: Other settings of the preset, as NAME=VALUE.
-        json: Print one JSON object.
-    """
-    from midway import presets as rules
-    from midway import settings as declarations
-
-    resolved = rules.resolve(env, agent, preset, settings(set))
-    rows = [
-        (name, value, resolved.sources.get(name, rules.Source("default of the agent")), allowed)
-        for config in (resolved.train, resolved.hyperparameters)
-        for name, value, allowed in declarations.declared(config)
-    ]
-    if json:
-        _print_json(
-            {name: {"value": plain(value), **source._asdict()} for name, value, source, _ in rows}
-        )
-        return
-    for name, value, source, allowed in rows:
-        mark = f" [not the paper's: {source.deviates}]" if source.deviates else ""
-        print(f"{name:22} {plain(value)!s:22} {allowed.meaning:38} {source.source}{mark}".rstrip())
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -380,12 +332,19 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "envs": envs,
     "presets": presets,
     "doctor": doctor,
+    "runs": runs,
+    "export": export,
+    "push": push,
+    "pull": pull,
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command; exit with 0, 1 (failed while running), 2 (wrong use) or 128 + a signal."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    if list(arguments) == ["--version"]:
+        print(f"midway {importlib.metadata.version('midway')}")
+        return
     try:
         command = parse(COMMANDS, arguments)
         from midway.training.compilation import use_compilation_cache
@@ -429,10 +388,6 @@ def _run_folders(paths: Sequence[Path]) -> list[Path]:
         below = sorted(config.parent for config in path.glob("*/config.json"))
         found += below if below and not (path / "config.json").exists() else [path]
     return found
-
-
-def _print_json(value: object) -> None:
-    print(json.dumps(value))
 
 
 def _say_where(run: "Run") -> None:

@@ -8,6 +8,7 @@ import os
 import platform
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from contextlib import AbstractContextManager
@@ -33,7 +34,7 @@ FORMAT = 3
 SEALED_SINCE = 3
 """The first format whose files all have checksums."""
 
-OUTSIDE = ("steps", "devices")
+OUTSIDE = ("steps", "devices", "stop_at")
 """Settings that may change when a run is continued."""
 
 PACKAGES = ("midway", "jax", "equinox", "optax", "mujoco", "gymnasium", "numpy")
@@ -137,6 +138,15 @@ def run_name(env: str, agent: str, seed: int) -> str:
     return "-".join([*parts, f"seed{seed}"])
 
 
+def free_folder(path: Path) -> Path:
+    """Return the path, or the first with a number behind it where nothing is yet."""
+    number, free = 1, path
+    while free.exists():
+        number += 1
+        free = path.with_name(f"{path.name}-{number}")
+    return free
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """Names of the files of a run."""
@@ -196,13 +206,38 @@ class RunFolder:
         """
         try:
             if self.path.exists() and (not self.path.is_dir() or self._strangers()):
-                hint = "use `midway resume`" if self.config_file.exists() else "choose another"
+                hint = (
+                    "use `midway resume` or --overwrite"
+                    if self.config_file.exists()
+                    else "choose another"
+                )
                 raise ConfigurationError(f"run folder {self.path} is not empty: {hint}")
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigurationError(
                 f"cannot make run folder {self.path}: {error.strerror}"
             ) from error
+
+    def clear(self) -> None:
+        """Delete the run in the folder, if there is one; its description goes last.
+
+        Raises:
+            ConfigurationError: It holds no run, or another process trains it.
+            OSError: Something cannot be deleted.
+        """
+        if not self.path.exists() or not self._strangers():
+            return
+        if not self.config_file.exists():
+            raise ConfigurationError(f"{self.path} is no run folder: nothing is overwritten")
+        check_format(read_json(self.config_file), self.config_file)
+        last = self.lock_file, self.config_file
+        with self.lock():
+            for path in (path for path in self.path.iterdir() if path not in last):
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
+            self.config_file.unlink()
 
     def _strangers(self) -> list[Path]:
         """Return what a process that was killed before its ``config.json`` does not leave."""
@@ -230,6 +265,20 @@ class RunFolder:
         again = {**provenance(), "steps": config.train.steps}
         continued = {**values, **config.to_json(), "resumed": [*values.get("resumed", []), again]}
         write_json(self.config_file, continued)
+
+    def note_end(self, step: int | None) -> None:
+        """Add to ``config.json`` the step that the run was ended at early; None: it goes on."""
+        values = {name: v for name, v in read_json(self.config_file).items() if name != "ended_at"}
+        write_json(self.config_file, values | ({} if step is None else {"ended_at": step}))
+
+    def ended_at(self) -> int | None:
+        """Return the step that the run was ended at before its settings do, if it was.
+
+        Raises:
+            ConfigurationError: This is no run folder.
+        """
+        step = read_json(self.config_file).get("ended_at")
+        return step if isinstance(step, int) else None
 
     def remove_unfinished(self) -> None:
         """Remove files that a process which was killed did not finish writing."""
