@@ -16,6 +16,7 @@ from midway.cli.lists import doctor, envs, presets, runs
 from midway.cli.parsing import Count, OptionalCount, parse, print_json, settings
 from midway.cli.saved import export, pull, push
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
+from midway.training import signals
 from midway.training.terminal import print_line
 
 if TYPE_CHECKING:
@@ -226,8 +227,11 @@ def sweep(
     wanted = sweeps.jobs(envs, agents, seeds, options)
     for job in wanted:
         check_settings(job, out, preset, changes)
-    with Live(console=Console(stderr=True), refresh_per_second=1) as live:
-        final = sweeps.run(wanted, out, lambda found: live.update(sweeps.table(found)), ray)
+    if sys.stderr.isatty():
+        with Live(console=Console(stderr=True), refresh_per_second=1) as live:
+            final = sweeps.run(wanted, out, lambda found: live.update(sweeps.table(found)), ray)
+    else:
+        final = sweeps.run(wanted, out, sweeps.Lines(print_line), ray)
     if any(status.state in ("stopped", "waiting") for status in final):
         print_line(f"stopped; type the same command again to go on: {out}")
         sys.exit(EXIT_SIGNAL + signal.SIGINT)
@@ -300,6 +304,7 @@ def bench(
     """
     from midway.bench import pieces as measure
     from midway.bench import plan as bench_plan
+    from midway.training.progress import stage
 
     pieces: dict[str, Callable[[], measure.Figures]] = {
         "update": lambda: measure.update(env, agent, batch, precision),
@@ -311,7 +316,10 @@ def bench(
     }
     chosen = pieces if what == "all" else {what: pieces[what]}
     of = {"env": env, "agent": agent, "batch": batch, "precision": precision, "num_envs": num_envs}
-    results = {name: piece() for name, piece in chosen.items()}
+    results = {}
+    for number, (name, piece) in enumerate(chosen.items()):
+        stage(f"bench {name}", number, len(chosen))
+        results[name] = piece()
     if json:
         print_json({"machine": measure.machine(), "settings": of, **results})
         return
@@ -339,6 +347,10 @@ COMMANDS: dict[str, Callable[..., None]] = {
 }
 
 
+KEEPING = ("train", "resume", "sweep")
+"""Commands that end by a signal with a checkpoint; the others keep nothing."""
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command; exit with 0, 1 (failed while running), 2 (wrong use) or 128 + a signal."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -350,7 +362,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         from midway.training.compilation import use_compilation_cache
 
         use_compilation_cache()
-        command()
+        if list(arguments)[:1] and arguments[0] in KEEPING:
+            command()
+            return
+        from midway.training.progress import showing_stages
+
+        with signals.ending_soon(), showing_stages():
+            command()
     except ConfigurationError as error:
         _fail(EXIT_USAGE, error)
     except (NonFiniteError, BrokenEnvironmentError) as error:
@@ -359,8 +377,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if "MUJOCO_GL" not in str(error):
             raise
         _fail(EXIT_USAGE, error)
-    except KeyboardInterrupt:
-        _fail(EXIT_SIGNAL + signal.SIGINT, "interrupted")
+    except KeyboardInterrupt as error:
+        _fail(EXIT_SIGNAL + getattr(error, "number", signal.SIGINT), "interrupted")
     except BrokenPipeError:
         sys.stdout = None
         sys.exit(EXIT_FAILED)

@@ -10,6 +10,7 @@ from midway.reports.cache import Cache
 from midway.reports.page import Section, Shown
 from midway.reports.runs import RunData, Runs, by_environment, read
 from midway.reports.style import Picture
+from midway.training.progress import stage
 
 PAGE = "report.html"
 TABLES = "data"
@@ -82,7 +83,11 @@ def _section(runs: Runs, out: Path) -> Section:
 
 def _drawn(found: Iterator[Picture], out: Path) -> list[Shown]:
     """Draw figures one by one and write their files."""
-    return [Shown(picture, style.save(picture.draw(), out / picture.stem)) for picture in found]
+    shown = []
+    for picture in found:
+        shown.append(Shown(picture, style.save(picture.draw(), out / picture.stem)))
+        stage(f"drawn {picture.stem}", len(shown), len(shown))
+    return shown
 
 
 def _unfinished(runs: Runs) -> Iterator[str]:

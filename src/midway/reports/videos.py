@@ -19,6 +19,7 @@ from midway.reports.recordings import Recording, record
 from midway.reports.runs import RunData, agent_labels, read
 from midway.reports.scenes import Frame, Scene
 from midway.runs import policy as policies
+from midway.training.progress import stage
 
 SECONDS = 8
 """How long a long episode takes in the video; short ones are shown at the lowest rate."""
@@ -109,12 +110,13 @@ def film(
     longest = max(recording.length for recording in recordings)
     rate = int(np.clip(longest / SECONDS, *rates))
     stride = max(1, round(longest / SECONDS / rate))
-    frames = (
-        frame
-        for recording in recordings
-        for frame in _frames(make(recording), recording, stride, rate)
-    )
-    return frames, rate
+
+    def frames() -> Iterator[Frame]:
+        for number, recording in enumerate(recordings):
+            stage("episode in the video", number, len(recordings))
+            yield from _frames(make(recording), recording, stride, rate)
+
+    return frames(), rate
 
 
 def write(path: Path, frames: Iterator[Frame], rate: int) -> None:

@@ -18,6 +18,9 @@ from midway.types import NumPyArray
 BATCH = "batch"
 """A side of a shape that is the size of the batch."""
 
+TRACED = 99_991
+"""Size of the batch while a policy is traced: a prime number that no layer is as wide as."""
+
 Shape: TypeAlias = tuple[int | str, ...]
 """Numbers, and ``BATCH``."""
 
@@ -85,12 +88,8 @@ def trace(function: Callable[..., Any], inputs: Sequence[str], sizes: Sequence[i
     Raises:
         ConfigurationError: It does something that has no place in a program.
     """
-    (batch,) = jax.export.symbolic_shape(BATCH)
-    shapes = [jax.ShapeDtypeStruct((batch, size), np.float32) for size in sizes]
-    try:
-        closed = jax.make_jaxpr(function)(*shapes)
-    except TypeError as error:  # it needs the size of the batch as a number
-        raise ConfigurationError("its policy is not the same for batches of any size") from error
+    shapes = [jax.ShapeDtypeStruct((TRACED, size), np.float32) for size in sizes]
+    closed = jax.make_jaxpr(function)(*shapes)
     program = Program(tuple(inputs), tuple(sizes))
     (output,) = _Tracer(program).run(closed, list(inputs))
     program.output = output
@@ -223,16 +222,15 @@ OTHERS: dict[str, Callable[[Any, list[Value], Shape], Parts | None]] = {
 """Primitives by name: what they are here, from the equation, its inputs and its output's shape."""
 
 
-def _shape(shape: Sequence[Any]) -> Shape:
-    return tuple(
-        int(side) if isinstance(side, int | np.integer) else _batch(side) for side in shape
-    )
+def _shape(shape: Sequence[int]) -> Shape:
+    """Return a shape with the size of the batch by its name.
 
-
-def _batch(side: object) -> str:
-    if str(side) != BATCH:
+    Raises:
+        ConfigurationError: A side is made of the batch and something else.
+    """
+    if any(side > TRACED and side % TRACED == 0 for side in shape):
         raise ConfigurationError("its policy mixes the rows of a batch, which cannot be exported")
-    return BATCH
+    return tuple(BATCH if side == TRACED else int(side) for side in shape)
 
 
 def _constant(value: Any) -> NumPyArray:

@@ -32,7 +32,7 @@ class RunState(NamedTuple):
 
 
 def found_below(folder: Path) -> list[Path]:
-    """Return the run folders in a folder and in those within it, sorted by name.
+    """Return the run folders in a folder and in those within it, or itself, sorted by name.
 
     Raises:
         ConfigurationError: There is no such folder.
