@@ -5,7 +5,18 @@ from pathlib import Path
 from typing import TypeAlias
 
 from midway.errors import ConfigurationError
-from midway.reports import curves, difficulty, health, images, imagined, maze, page, style, tabletop
+from midway.reports import (
+    curves,
+    difficulty,
+    failures,
+    health,
+    images,
+    imagined,
+    maze,
+    page,
+    style,
+    tabletop,
+)
 from midway.reports.cache import Cache
 from midway.reports.page import Section, Shown
 from midway.reports.runs import RunData, Runs, by_environment, read
@@ -21,6 +32,7 @@ Figures: TypeAlias = Callable[[Runs, Cache], Iterator[Picture]]
 FIGURES: tuple[Figures, ...] = (
     curves.figures,
     maze.figures,
+    failures.figures,
     difficulty.figures,
     imagined.figures,
     tabletop.figures,
