@@ -84,10 +84,8 @@ def test_observations_that_are_not_the_environments_are_refused(foreign: bool) -
 
 def test_an_exported_policy_takes_and_gives_what_the_environment_does(tmp_path: Path) -> None:
     def hidden() -> Any:
-        env = fakes.Hidden()
-        env.action_space = spaces.Box(np.array([-2, 10], np.float32), np.array([0, 30], np.float32))
-        env.step = lambda action: env.env.step(np.clip(action, -1, 1).astype(np.float32))
-        return env
+        low, high = np.array([-2, 10], np.float32), np.array([0, 30], np.float32)
+        return gymnasium.wrappers.RescaleAction(fakes.Hidden(), low, high)
 
     foreign = describe(hidden)
     config = configure(foreign, "sac", changes={"hidden": (8,)})

@@ -59,9 +59,7 @@ def users_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "users_networks", module)
 
 
-def test_a_run_trains_with_them_and_its_policy_loads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_trains_with_them_and_its_policy_loads(tmp_path: Path) -> None:
     run = midway.train("point-u", agent="ris", out=tmp_path / "run", changes=TINY)
     policy: Any = midway.load(run.path)
     state = policy.state
@@ -72,15 +70,12 @@ def test_a_run_trains_with_them_and_its_policy_loads(
     assert policy(*pair).shape == (3, 2)
     assert midway.resume(run.path, steps=60).finished
     assert (midway.load(run.path)(*pair) != policy(*pair)).any()
-    monkeypatch.delitem(sys.modules, "users_networks")
-    with pytest.raises(ConfigurationError, match="No module named 'users_networks'"):
-        midway.load(run.path)
 
 
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("residual", "Empty module name|No module"),
+        ("residual", "No module named 'residual'"),
         ("users_networks:nothing", "no attribute 'nothing'"),
         ("users_networks:number", "is a int, not a function"),
         ("users_networks:whole", r"makes float32 \(3, 5\) of \(3, 5\): must be float32 \(3, 2\)"),

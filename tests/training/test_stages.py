@@ -13,7 +13,7 @@ import hashlib, sys
 from midway.training.signals import ending_soon
 with ending_soon(grace=0.2):
     print("ready", flush=True)
-    hashlib.pbkdf2_hmac("sha256", b"native", b"code", 10**10)
+    hashlib.pbkdf2_hmac("sha256", b"native", b"code", 10**9)
 """
 
 
