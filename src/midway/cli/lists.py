@@ -104,8 +104,8 @@ def runs(folder: Positional[Path] = Path("runs"), json: bool = False) -> None:
         return
     width = max(map(len, rows), default=0)
     for name, row in rows.items():
-        success = "" if row["success"] is None else f"success {row['success']:.0%}"
+        reached = "" if row["success"] is None else f"success {row['success']:.0%}"
         steps = "" if row["steps"] is None else f"{row['step']:,}/{row['steps']:,}"
-        print(f"{name:{width}}  {row['state']:11}  {steps:>19}  {success}  {row['why']}".rstrip())
+        print(f"{name:{width}}  {row['state']:11}  {steps:>19}  {reached}  {row['why']}".rstrip())
     if not rows:
         print(f"no runs below {folder}")

@@ -136,8 +136,16 @@ def resume(
     from midway import api
     from midway.runs.tracking import watching
 
-    watched = {"progress": True, "stop_at": stop_at, "callbacks": watching(wandb)}
-    _say_where(api.resume(run, steps, devices=devices, from_step=from_, **watched))
+    continued = api.resume(
+        run,
+        steps=steps,
+        devices=devices,
+        progress=True,
+        from_step=from_,
+        stop_at=stop_at,
+        callbacks=watching(wandb),
+    )
+    _say_where(continued)
 
 
 def evaluate(

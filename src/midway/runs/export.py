@@ -57,7 +57,7 @@ def program_of(policy: Policy) -> Program:
         shown = [observation, achieved_goal] if appended else [observation]
         pair = jnp.concatenate(shown, axis=-1), desired_goal
         actions = agent.act(policy.state, *pair, jax.random.key(0), False)
-        return low + (jnp.clip(actions, -1, 1) + 1) / 2 * (high - low)
+        return jnp.asarray(low) + (jnp.clip(actions, -1, 1) + 1) / 2 * jnp.asarray(high - low)
 
     (goal,) = spec.goal_shape
     size = spec.observation_shape[0] - (goal if appended else 0)

@@ -4,7 +4,7 @@ import logging
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast, runtime_checkable
 
 from rich.console import Console
 from rich.progress import (
@@ -124,8 +124,7 @@ class _StageBar(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Move the bar."""
-        assert isinstance(record.args, tuple)
-        name, done, total = record.args
+        name, done, total = cast(tuple[str, int, int], record.args)
         with heard():
             self._progress.update(self._task, description=name, completed=done, total=total)
 
