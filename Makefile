@@ -13,16 +13,19 @@ QUICK := tests/test_architecture.py tests/test_dependencies.py tests/test_functi
 PYTEST := $(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 COVERAGE := --cov=midway
 
-.PHONY: train check test test-all test-lowest lint format clean
+INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-$(VENV)/installed: pyproject.toml
+.PHONY: train check test test-all test-lowest tested lint format clean
+
+# The tested set: newer releases of what midway needs come in through constraints.txt alone.
+$(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(INSTALL) '.[dev]'
 	touch $@
 
 $(VENV)/installed-extras: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --editable '.[dev,cluster,data,robotics]'
+	$(INSTALL) '.[dev,cluster,data,docs,robotics]'
 	touch $@
 
 # Typed again, it continues where it was stopped.
@@ -52,6 +55,10 @@ test-lowest:
 	$(VENV)-lowest/bin/python -m pip install --quiet --editable '.[dev,cluster]' \
 		--constraint $(VENV)-lowest/constraints.txt
 	$(VENV)-lowest/bin/pytest --numprocesses auto --dist loadfile $(QUICK) tests/envs/test_mazes.py tests/envs/test_point_maze.py
+
+# After `pip install --upgrade` and `make test-all`: what constraints.txt is to hold.
+tested: $(VENV)/installed-extras
+	@$(BIN)/python .ci/tested.py
 
 lint: $(VENV)/installed
 	$(BIN)/ruff format --check .
