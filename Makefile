@@ -15,7 +15,7 @@ COVERAGE := --cov=midway
 
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: train check test test-all test-lowest tested lint format clean
+.PHONY: train check test test-all test-lowest tested site docs lint format clean
 
 # The tested set: newer releases of what midway needs come in through constraints.txt alone.
 $(VENV)/installed: pyproject.toml constraints.txt
@@ -41,11 +41,19 @@ check: lint
 
 # Everything that needs no extra.
 test: lint
-	$(PYTEST) $(COVERAGE) -m "not extra"
+	$(PYTEST) $(COVERAGE) -m "not extra and not docs and not release"
 
 # Everything. Chromium and Xvfb are Debian's: .ci/run installs them.
 test-all: $(VENV)/installed-extras lint
-	$(PYTEST) $(COVERAGE)
+	$(PYTEST) $(COVERAGE) -m "not docs and not release"
+
+# The site, in build/site: fails at a broken link between pages or to a docstring.
+site: $(VENV)/installed-extras
+	$(BIN)/sphinx-build --builder html --fail-on-warning --keep-going --quiet docs build/site
+
+# The site, and every block of its pages as it is written: commands and Python, with tiny runs.
+docs: site
+	$(BIN)/pytest tests/test_docs.py
 
 # The quick tests with the oldest releases that pyproject.toml allows, in a venv of their own.
 test-lowest:
