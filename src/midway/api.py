@@ -224,7 +224,7 @@ def load(path: str | Path) -> Policy:
     Raises:
         ConfigurationError: The folder holds no policy, or a damaged or foreign one.
     """
-    return policies.load(RunFolder(Path(path)))
+    return policies.load(RunFolder.at(path))
 
 
 def evaluate(
