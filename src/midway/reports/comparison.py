@@ -23,6 +23,9 @@ from midway.statistics import Estimate, Scores, improvement, of_runs, performanc
 THRESHOLDS = np.linspace(0, 1, 201)
 """Success rates at which profiles are drawn."""
 
+LIMITS = (-0.04, 1.04)
+"""Of the axes of shares, with room for marks at both ends."""
+
 LETTERS = 20
 """Letters in a line of a pair's name."""
 
@@ -129,6 +132,7 @@ def _draw_means(axes: Axes, each: Sequence[Side], title: str) -> None:
     for place, side in enumerate(each):
         _draw_estimate(axes, place, side.success, side.group.colour, side.group.marker)
     _share_axis(axes.xaxis)
+    axes.set_xlim(*LIMITS)
     axes.set_yticks([])
     _room(axes, len(each))
     style.label(axes, f"Success, {title}", "interquartile mean")
@@ -143,7 +147,7 @@ def _draw_profiles(axes: Axes, each: Sequence[Side]) -> None:
         )
     _share_axis(axes.xaxis)
     _share_axis(axes.yaxis)
-    axes.set_xlim(-0.03, 1.03)
+    axes.set_xlim(*LIMITS)
     style.label(axes, "Runs with more success", "success")
 
 
@@ -155,7 +159,7 @@ def _draw_probabilities(axes: Axes, each: Sequence[Side]) -> None:
     axes.axvline(0.5, color=style.MUTED, linestyle=":", linewidth=1.4)
     axes.set_yticks(range(len(pairs)), names)
     _share_axis(axes.xaxis)
-    axes.set_xlim(-0.03, 1.03)
+    axes.set_xlim(*LIMITS)
     _room(axes, len(pairs))
     style.label(axes, "Who is better", "probability of improvement")
 
