@@ -195,8 +195,13 @@ class RunFolder:
 
     @property
     def past_policies(self) -> Path:
-        """Folder of snapshots of the weights, for figures."""
+        """Folder of weights that were kept on the way: snapshots, and the best."""
         return self.path / "policies"
+
+    @property
+    def best_weights(self) -> Path:
+        """``policies/best.safetensors``: the weights of the best policy, and how good it is."""
+        return self.past_policies / "best.safetensors"
 
     @property
     def policy_config(self) -> Path:
