@@ -14,8 +14,10 @@ from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteE
 from midway.runs import complete
 from midway.runs import policy as policies
 from midway.runs.callbacks import Callback, Watchers
-from midway.runs.folder import RunConfig, RunFolder, free_folder, run_name
-from midway.runs.policy import Policy
+from midway.runs.folder import RunConfig, RunFolder, run_name
+from midway.runs.place import clear, free_folder
+from midway.runs.policy import Policy, Which
+from midway.runs.sinks import RunSinks
 from midway.settings import changed
 from midway.training import loop, seeds, signals, state
 from midway.training.checkpoint import Checkpoints, steps_in
@@ -95,7 +97,7 @@ def train(
     setup = setup_of(config, folder)
     state.check(setup)
     if overwrite:
-        folder.clear()
+        clear(folder)
     folder.prepare()
     with folder.lock():
         folder.create(config)
@@ -151,13 +153,18 @@ def resume(
         return _run_locked(config, folder, setup, (progress, callbacks), number)
 
 
-def load(path: str | Path) -> Policy:
+def load(path: str | Path, policy: Which = "last") -> Policy:
     """Return the policy of a run: ``policy(observation, goal) -> action``.
 
+    Args:
+        path: The run folder.
+        policy: ``last``, ``best``, or an environment step whose policy was kept.
+
     Raises:
-        ConfigurationError: The folder holds no policy, or a damaged or foreign one.
+        ConfigurationError: The folder holds no such policy, or a damaged or foreign one.
     """
-    return policies.load(RunFolder(Path(path)))
+    folder = RunFolder.at(path)
+    return policies.load(folder, policies.weights_of(folder, policy))
 
 
 def evaluate(
@@ -167,6 +174,7 @@ def evaluate(
     task: str | None = None,
     actions: ActionKind = "mean",
     seed: int = 0,
+    policy: Which = "last",
 ) -> Evaluation:
     """Run episodes of a trained policy.
 
@@ -176,88 +184,19 @@ def evaluate(
         task: ``hard``, ``uniform`` or a named case of the environment; default: ``hard`` where
             there is one, else the environment's own starts and goals.
         actions: ``mean`` or ``sampled``.
-        seed: Seed of starts and goals.
+        seed: Seed of starts and goals, which no training meets.
+        policy: As in `load`.
 
     Raises:
-        ConfigurationError: The folder, the task or the number of episodes cannot be used.
+        ConfigurationError: The folder, policy, task or number of episodes cannot be used.
     """
     if episodes < 1:
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
-    policy = load(path)
-    declared = policy.config.declaration()
+    loaded = load(path, policy)
+    declared = loaded.config.declaration()
     task = task or declared.shown_task
     env = declared.factory(num_envs=episodes, task=task)
-    return run_episodes(env, policy.actor(actions, seed), task, actions, seeds.evaluation(seed))
-
-
-class RunSinks:
-    """Puts what a run says into its folder, and on the terminal.
-
-    Args:
-        config: The configuration of the run.
-        folder: Its folder.
-        logger: Its CSV and TensorBoard files.
-        checkpoints: Its checkpoints.
-        say: Its terminal.
-        watchers: Those who watch it.
-    """
-
-    def __init__(
-        self,
-        config: RunConfig,
-        folder: RunFolder,
-        logger: Logger,
-        checkpoints: Checkpoints,
-        say: Reporter,
-        watchers: Watchers,
-    ) -> None:
-        self._config = config
-        self._folder = folder
-        self._checkpoints = checkpoints
-        self.message, self.progress = say.message, say.advance
-        self._logger = logger
-        self._watchers = watchers
-        self._row: Mapping[str, int | float] = {}
-        self._results: list[Evaluation] = []
-
-    def metrics(self, step: int, values: dict[str, int | float]) -> None:
-        """Write one row of scalars."""
-        self._logger.metrics(step, values)
-        self._row = values
-
-    def evaluation(self, step: int, clock: loop.Clock, result: Evaluation) -> None:
-        """Write one row for an evaluated task and kind of action."""
-        self._logger.evaluation(step, clock, result)
-        self._results.append(result)
-
-    def watched(self, training: Training) -> bool:
-        """Show what was written last to those who watch; note it where they end the run."""
-        shown = self._row, self._results
-        self._row, self._results = {}, []
-        why, step = self._watchers.verdict(training, *shown), training.counters.steps
-        if why and step < training.last_step:
-            self._folder.note_end(step)
-            self.message(f"ends at step {step}: {why}")
-        return bool(why)
-
-    def snapshot(self, training: Training) -> None:
-        """Keep the weights of this step, for figures."""
-        policies.keep(self._folder, self._config, training)
-
-    def checkpoint(self, training: Training) -> None:
-        """Write a checkpoint and the policy.
-
-        Raises:
-            NonFiniteError: A network is not finite; nothing is written then.
-        """
-        loop.check_finite(training)
-        stored = state.state_dict(training)
-        self._checkpoints.save(training.counters.steps, stored, training.env_spec)
-        self.policy(training)
-
-    def policy(self, training: Training) -> None:
-        """Write the policy."""
-        policies.save(self._folder, self._config, training)
+    return run_episodes(env, loaded.actor(actions, seed), task, actions, seeds.evaluation(seed))
 
 
 def _chosen(folder: RunFolder, config: RunConfig, from_step: int | None) -> int | None:
@@ -335,6 +274,8 @@ def _run(
     if number is not None:
         training = state.restore(training, checkpoints, number)
         folder.note_resume(config)
+    else:
+        folder.best_weights.unlink(missing_ok=True)
     steps, training.ends_at = training.counters.steps, folder.ended_at()
     checkpoints.set_aside_after(steps)
     files = folder.metrics_file, folder.evaluation_file, folder.path / "events"
@@ -354,7 +295,7 @@ def _complete(training: Training, sinks: RunSinks, folder: RunFolder, asked: sig
     steps, train = training.counters.steps, training.setup.train
     if complete.policy_step(folder) != steps:
         sinks.policy(training)
-    due = loop.is_due(training, train.evaluate_every)
+    due = steps > 0 and loop.is_due(training, train.evaluate_every)
     if due and not complete.is_evaluated(folder, steps):
         loop.take_evaluation(training, sinks, {}, asked)
         asked.check()

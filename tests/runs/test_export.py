@@ -13,7 +13,7 @@ import midway
 from midway import configuration
 from midway.agents import registry
 from midway.errors import ConfigurationError
-from midway.runs import export
+from midway.runs import export, export_onnx
 from midway.runs.policy import Policy
 from midway.training.step import create_state
 
@@ -57,7 +57,7 @@ def test_the_model_acts_as_the_policy(env: str, agent: str, tmp_path: Path) -> N
     from onnx.reference import ReferenceEvaluator
 
     policy = untrained(env, agent)
-    export.check(policy, export.write_onnx(policy, tmp_path / "policy.onnx"))
+    export.check(policy, export_onnx.write_onnx(policy, tmp_path / "policy.onnx"))
     model = onnx.load(tmp_path / "policy.onnx")
     onnx.checker.check_model(model, full_check=True)
     batch = shown(policy, 5)
@@ -94,4 +94,4 @@ def test_what_cannot_be_exported_is_refused_by_name(monkeypatch: pytest.MonkeyPa
         export.program_of(untrained("push", "sac"))
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ConfigurationError, match=r"pip install 'midway\[onnx\]'"):
-        export.write_onnx(untrained("point-u", "sac"), Path("unused"))
+        export_onnx.write_onnx(untrained("point-u", "sac"), Path("unused"))

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from midway.cli.about import NOTHING, AboutEnv
+from midway.cli.compare import compare
 from midway.cli.lists import doctor, envs, presets, runs
-from midway.cli.parsing import Count, OptionalCount, parse, print_json, settings
+from midway.cli.measure import bench, check
+from midway.cli.parsing import Count, Kept, OptionalCount, parse, print_json, run_folders, settings
 from midway.cli.saved import export, pull, push
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
 from midway.training import signals
@@ -92,29 +94,6 @@ def train(
     _say_where(run)
 
 
-def check(
-    env: Positional[str],
-    num_envs: Count = 16,
-    seconds: float = 15.0,
-    about: AboutEnv = NOTHING,
-) -> None:
-    """Say what midway sees of a goal environment, and what is wrong with it.
-
-    Args:
-        env: Environment name, a Gymnasium id, module:Id or module:callable.
-        num_envs: Environments that are stepped together to measure.
-        seconds: How long random actions are taken, at most.
-        about: What midway must be told of an environment that is not its own.
-    """
-    from midway.envs import examine
-
-    findings = examine.examine(env, about.settings(), num_envs, seconds, **about.source())
-    for label, text, _ in findings:
-        print(f"{label:15} {text}")
-    if not all(ok for _, _, ok in findings):
-        sys.exit(EXIT_USAGE)
-
-
 def resume(
     run: Positional[Path],
     steps: OptionalCount = None,
@@ -154,6 +133,7 @@ def evaluate(
     task: str | None = None,
     actions: Literal["mean", "sampled"] = "mean",
     seed: int = 0,
+    policy: Kept = "last",
     json: bool = False,
 ) -> None:
     """Run episodes of a trained policy and print how many reach their goal.
@@ -164,11 +144,14 @@ def evaluate(
         task: hard, uniform, or a numbered case of the environment; default: hard, if there is one.
         actions: Mean or sampled actions.
         seed: Seed of starts and goals.
+        policy: The best policy of the run, the last, or that of a step whose policy was kept.
         json: Print one JSON object, with every episode.
     """
     from midway import api
 
-    result = api.evaluate(run, episodes=episodes, task=task, actions=actions, seed=seed)
+    result = api.evaluate(
+        run, episodes=episodes, task=task, actions=actions, seed=seed, policy=policy
+    )
     if json:
         episodes_json = [dataclasses.asdict(episode) for episode in result.episodes]
         print_json(
@@ -177,7 +160,9 @@ def evaluate(
                 "task": result.task,
                 "actions": actions,
                 "seed": seed,
+                "policy": policy,
                 "success_rate": result.success_rate,
+                "interval": result.success[1:],
                 "final_distance": result.final_distance,
                 "episodes": episodes_json,
             }
@@ -185,7 +170,7 @@ def evaluate(
         return
     named = ", ".join(f"{name} {d:.3f} m" for name, d in result.final_distances.items())
     print(
-        f"{run}: {result.task}, {actions} actions: success {result.success_rate:.1%} of {episodes} "
+        f"{run}: {result.task}, {actions} actions: success {result.success:.1%} of {episodes} "
         f"episodes, {result.length:.1f} steps, {result.final_distance:.2f} m from the goal"
         + (f" ({named})" if named else "")
     )
@@ -249,16 +234,19 @@ def sweep(
     print(f"finished {out}")
 
 
-def report(runs: Positional[tuple[Path, ...]], out: Path | None = None) -> None:
+def report(
+    runs: Positional[tuple[Path, ...]], out: Path | None = None, policy: Kept = "last"
+) -> None:
     """Draw figures and one HTML page from run folders.
 
     Args:
         runs: Run folders, or the folder of a sweep.
         out: Folder for the figures; default: figures in the run folder, or report beside the first.
+        policy: The policies that are drawn: best, last, or those of a step.
     """
     from midway import reports
 
-    for path in reports.report(_run_folders(runs), out):
+    for path in reports.report(run_folders(runs), out, policy):
         print(path)
 
 
@@ -268,6 +256,7 @@ def watch(
     task: str | None = None,
     episodes: Count = 1,
     seed: int = 0,
+    policy: Kept = "last",
     live: bool = False,
 ) -> None:
     """Write a video of the policy with its imagined subgoals, or show it in a window.
@@ -278,6 +267,7 @@ def watch(
         task: hard, uniform, or a numbered case of the environment; default: hard, if there is one.
         episodes: Number of episodes.
         seed: Seed of starts and goals.
+        policy: The best policy of the run, the last, or that of a step whose policy was kept.
         live: Show the episodes in a window instead; needs a display.
     """
     from midway import reports
@@ -285,55 +275,9 @@ def watch(
     if live:
         if out is not None:
             raise ConfigurationError(f"--out {out}: --live writes no file")
-        reports.show(run, task=task, episodes=episodes, seed=seed)
+        reports.show(run, task=task, episodes=episodes, seed=seed, policy=policy)
         return
-    print(reports.watch(run, out, task=task, episodes=episodes, seed=seed))
-
-
-def bench(
-    what: Positional[Literal["all", "update", "env", "replay", "loop", "memory", "plan"]] = "all",
-    env: str = "ant-u",
-    agent: str = "ris",
-    batch: Count = 256,
-    precision: Literal["f32", "bf16"] = "f32",
-    num_envs: Count = 64,
-    json: bool = False,
-) -> None:
-    """Measure how fast this machine updates, simulates, stores and plans, and what memory it takes.
-
-    Args:
-        what: One piece, or all of them.
-        env: Environment name.
-        agent: Agent name.
-        batch: Transitions of one update.
-        precision: Matrix products in float32 or bfloat16.
-        num_envs: Environments that are stepped together in env.
-        json: Print one JSON object.
-    """
-    from midway.bench import pieces as measure
-    from midway.bench import plan as bench_plan
-    from midway.training.progress import stage
-
-    pieces: dict[str, Callable[[], measure.Figures]] = {
-        "update": lambda: measure.update(env, agent, batch, precision),
-        "env": lambda: measure.environment(env, num_envs),
-        "replay": lambda: measure.replay(env, batch),
-        "loop": lambda: measure.whole_loop(env, agent, batch, precision),
-        "memory": lambda: measure.memory(env, agent, batch, precision),
-        "plan": lambda: bench_plan.plan(env, precision),
-    }
-    chosen = pieces if what == "all" else {what: pieces[what]}
-    of = {"env": env, "agent": agent, "batch": batch, "precision": precision, "num_envs": num_envs}
-    results = {}
-    for number, (name, piece) in enumerate(chosen.items()):
-        stage(f"bench {name}", number, len(chosen))
-        results[name] = piece()
-    if json:
-        print_json({"machine": measure.machine(), "settings": of, **results})
-        return
-    print(", ".join(f"{name} {value}" for name, value in {**measure.machine(), **of}.items()))
-    for name, figures in results.items():
-        print(f"{name:8}" + "  ".join(f"{key} {value:.4g}" for key, value in figures.items()))
+    print(reports.watch(run, out, task=task, episodes=episodes, seed=seed, policy=policy))
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -343,6 +287,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "sweep": sweep,
     "evaluate": evaluate,
     "report": report,
+    "compare": compare,
     "watch": watch,
     "bench": bench,
     "envs": envs,
@@ -405,15 +350,6 @@ def _fail(status: int, error: object) -> None:
     text = " ".join(str(error).split())
     print_line(f"midway: {text}")
     sys.exit(status)
-
-
-def _run_folders(paths: Sequence[Path]) -> list[Path]:
-    """Return the paths, with the folder of a sweep replaced by its runs."""
-    found: list[Path] = []
-    for path in paths:
-        below = sorted(config.parent for config in path.glob("*/config.json"))
-        found += below if below and not (path / "config.json").exists() else [path]
-    return found
 
 
 def _say_where(run: "Run") -> None:

@@ -19,6 +19,7 @@ def export(
         out: Folder of the files; default: export in the run folder.
     """
     from midway.runs import export as exports
+    from midway.runs import export_onnx
     from midway.runs import policy as policies
     from midway.runs.folder import RunFolder
 
@@ -31,7 +32,7 @@ def export(
     if numpy:
         written[folder / "policy.py"] = exports.write_numpy(policy, folder / "policy.py")
     if onnx:
-        written[folder / "policy.onnx"] = exports.write_onnx(policy, folder / "policy.onnx")
+        written[folder / "policy.onnx"] = export_onnx.write_onnx(policy, folder / "policy.onnx")
     for path, act in written.items():
         print(f"{path}: actions within {exports.check(policy, act):.0e} of the policy's")
 

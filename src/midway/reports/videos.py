@@ -9,16 +9,16 @@ from itertools import chain
 from pathlib import Path
 from subprocess import PIPE
 
-import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
-from midway.errors import ConfigurationError
+from midway.errors import ConfigurationError, needing
 from midway.reports import scenes
 from midway.reports.recordings import Recording, record
 from midway.reports.runs import RunData, agent_labels, read
 from midway.reports.scenes import Frame, Scene
 from midway.runs import policy as policies
+from midway.runs.policy import Which
 from midway.training.progress import stage
 
 SECONDS = 8
@@ -45,6 +45,7 @@ def watch(
     task: str | None = None,
     episodes: int = 1,
     seed: int = 0,
+    policy: Which = "last",
 ) -> Path:
     """Write a video of a trained policy, which acts deterministically.
 
@@ -55,14 +56,15 @@ def watch(
             is one.
         episodes: Number of episodes, one after the other.
         seed: Seed of starts and goals.
+        policy: ``last``, ``best``, or a step whose policy was kept.
 
     Returns:
         The file.
 
     Raises:
-        ConfigurationError: The folder, task, number or file cannot be used.
+        ConfigurationError: The folder, policy, task, number or file cannot be used.
     """
-    run = read(path)
+    run = read(path, policy)
     task = task or run.config.declaration().shown_task
     out = out or run.folder.path / "videos" / f"{task}.mp4"
     if out.suffix not in RATES:
@@ -72,7 +74,13 @@ def watch(
     return out
 
 
-def show(path: Path, task: str | None = None, episodes: int = 1, seed: int = 0) -> None:
+def show(
+    path: Path,
+    task: str | None = None,
+    episodes: int = 1,
+    seed: int = 0,
+    policy: Which = "last",
+) -> None:
     """Show the same in a window, until the last episode has ended or the window is closed.
 
     Args:
@@ -80,11 +88,12 @@ def show(path: Path, task: str | None = None, episodes: int = 1, seed: int = 0) 
         task: As in ``watch``.
         episodes: As in ``watch``.
         seed: As in ``watch``.
+        policy: As in ``watch``.
 
     Raises:
         ConfigurationError: As in ``watch``, or there is no display here.
     """
-    run = read(path)
+    run = read(path, policy)
     task = task or run.config.declaration().shown_task
     check_display()
     frames, rate = film(run, task, episodes, seed, RATES[".mp4"])
@@ -101,7 +110,7 @@ def film(
     """
     if episodes < 1:
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
-    policy = policies.load(run.folder)
+    policy = policies.load(run.folder, run.weights)
     (label,) = agent_labels([run.config.agent])
     title = f"{label} on {run.config.env}, {task}"
     make = scenes.maker(run.folder, policy, title)
@@ -146,6 +155,8 @@ def write(path: Path, frames: Iterator[Frame], rate: int) -> None:
 
 def _write_mp4(path: Path, frames: Iterator[Frame], rate: int) -> None:
     """Pipe the frames to ffmpeg; imageio's own writer would fork, which JAX's threads forbid."""
+    with needing("video", f"the video {path.name}"):
+        import imageio_ffmpeg
     first = next(frames)
     size = f"{first.shape[1]}x{first.shape[0]}"
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y"]

@@ -2,15 +2,8 @@
 
 import dataclasses
 import hashlib
-import importlib.metadata
 import json
-import os
-import platform
 import re
-import shlex
-import shutil
-import subprocess
-import sys
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +16,7 @@ from midway.envs.layouts import Layout
 from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
 from midway.runs import lock
+from midway.runs.provenance import provenance
 from midway.settings import changed
 from midway.training.checkpoint import Owner
 from midway.training.config import TrainConfig
@@ -36,8 +30,6 @@ SEALED_SINCE = 3
 
 OUTSIDE = ("steps", "devices", "stop_at")
 """Settings that may change when a run is continued."""
-
-PACKAGES = ("midway", "jax", "equinox", "optax", "mujoco", "gymnasium", "numpy")
 
 
 @dataclass(frozen=True)
@@ -138,13 +130,8 @@ def run_name(env: str, agent: str, seed: int) -> str:
     return "-".join([*parts, f"seed{seed}"])
 
 
-def free_folder(path: Path) -> Path:
-    """Return the path, or the first with a number behind it where nothing is yet."""
-    number, free = 1, path
-    while free.exists():
-        number += 1
-        free = path.with_name(f"{path.name}-{number}")
-    return free
+ZOO = Path(__file__).parents[3] / "zoo"
+"""Trained policies of the repository; a wheel holds none."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +139,22 @@ class RunFolder:
     """Names of the files of a run."""
 
     path: Path
+
+    @classmethod
+    def at(cls, path: str | Path) -> "RunFolder":
+        """Return the folder of a path, or of a policy that comes with midway: ``zoo:ant-u-ris``.
+
+        Raises:
+            ConfigurationError: There is no such policy.
+        """
+        name = str(path).removeprefix("zoo:")
+        if name == str(path):
+            return cls(Path(path))
+        known = sorted(folder.parent.name for folder in ZOO.glob("*/policy.json"))
+        if name not in known:
+            there = ", ".join(known) or "nothing: it comes with a checkout"
+            raise ConfigurationError(f"{path}: the zoo has {there}")
+        return cls(ZOO / name)
 
     @property
     def config_file(self) -> Path:
@@ -185,8 +188,13 @@ class RunFolder:
 
     @property
     def past_policies(self) -> Path:
-        """Folder of snapshots of the weights, for figures."""
+        """Folder of weights that were kept on the way: snapshots, and the best."""
         return self.path / "policies"
+
+    @property
+    def best_weights(self) -> Path:
+        """``policies/best.safetensors``: the weights of the best policy, and how good it is."""
+        return self.past_policies / "best.safetensors"
 
     @property
     def policy_config(self) -> Path:
@@ -205,7 +213,7 @@ class RunFolder:
             ConfigurationError: There is a run already, other files lie there, or it cannot be made.
         """
         try:
-            if self.path.exists() and (not self.path.is_dir() or self._strangers()):
+            if self.path.exists() and (not self.path.is_dir() or self.strangers()):
                 hint = (
                     "use `midway resume` or --overwrite"
                     if self.config_file.exists()
@@ -218,29 +226,8 @@ class RunFolder:
                 f"cannot make run folder {self.path}: {error.strerror}"
             ) from error
 
-    def clear(self) -> None:
-        """Delete the run in the folder, if there is one; its description goes last.
-
-        Raises:
-            ConfigurationError: It holds no run, or another process trains it.
-            OSError: Something cannot be deleted.
-        """
-        if not self.path.exists() or not self._strangers():
-            return
-        if not self.config_file.exists():
-            raise ConfigurationError(f"{self.path} is no run folder: nothing is overwritten")
-        check_format(read_json(self.config_file), self.config_file)
-        last = self.lock_file, self.config_file
-        with self.lock():
-            for path in (path for path in self.path.iterdir() if path not in last):
-                if path.is_dir() and not path.is_symlink():
-                    shutil.rmtree(path)
-                else:
-                    path.unlink()
-            self.config_file.unlink()
-
-    def _strangers(self) -> list[Path]:
-        """Return what a process that was killed before its ``config.json`` does not leave."""
+    def strangers(self) -> list[Path]:
+        """Return what is there but what a process leaves that is killed before ``config.json``."""
         left = (self.lock_file.name, self.config_file.name + files.UNFINISHED)
         return [path for path in self.path.iterdir() if path.name not in left]
 
@@ -251,7 +238,7 @@ class RunFolder:
             ConfigurationError: There is a run already, other files lie there, or it cannot be made.
         """
         self.prepare()
-        values = {**config.to_json(), "run": config.identity, **provenance()}
+        values = {**config.to_json(), "run": config.identity, "format": FORMAT, **provenance()}
         try:
             write_json(self.config_file, values)
         except OSError as error:
@@ -262,7 +249,7 @@ class RunFolder:
     def note_resume(self, config: RunConfig) -> None:
         """Add to ``config.json`` how the run was continued, and its new number of steps."""
         values = read_json(self.config_file)
-        again = {**provenance(), "steps": config.train.steps}
+        again = {"format": FORMAT, **provenance(), "steps": config.train.steps}
         continued = {**values, **config.to_json(), "resumed": [*values.get("resumed", []), again]}
         write_json(self.config_file, continued)
 
@@ -322,34 +309,6 @@ class RunFolder:
             return RunConfig.from_json(values)
         except ConfigurationError as error:
             raise ConfigurationError(f"{self.config_file}: {error}") from error
-
-
-def provenance() -> JsonObject:
-    """Return format, versions, commit, machine and command."""
-    return {
-        "format": FORMAT,
-        "versions": {
-            "python": platform.python_version(),
-            **{name: importlib.metadata.version(name) for name in PACKAGES},
-        },
-        "commit": _commit(),
-        "machine": {"processor": platform.machine(), "cores": len(os.sched_getaffinity(0))},
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-    }
-
-
-def _commit() -> str | None:
-    """Return the commit of the source tree that the package runs from, if it is one."""
-    try:
-        answer = subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"],
-            capture_output=True,
-            text=True,
-            timeout=10,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return answer.stdout.strip() if answer.returncode == 0 else None
 
 
 def write_json(path: Path, values: JsonObject) -> None:
