@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from midway import files
-from midway.errors import ConfigurationError
+from midway.errors import needing
 from midway.runs.export import Act, program_of
 from midway.runs.policy import Policy
 from midway.runs.program import BATCH, Operation, Program, Shape
@@ -61,11 +61,9 @@ def write_onnx(policy: Policy, path: Path) -> Act:
         ConfigurationError: As `program_of`, or ONNX is not installed.
         OSError: The file cannot be written.
     """
-    try:
+    with needing("onnx", "export --onnx"):
         import onnx
         from onnx.reference import ReferenceEvaluator
-    except ImportError as error:
-        raise ConfigurationError("export --onnx: pip install 'midway[onnx]'") from error
     program = program_of(policy)
     model = _Model(onnx.helper, program).build()
     onnx.checker.check_model(model)

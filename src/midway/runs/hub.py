@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from midway import files
-from midway.errors import ConfigurationError
+from midway.errors import ConfigurationError, needing
 from midway.runs import policy as policies
 from midway.runs.folder import RunFolder
 from midway.runs.policy import Policy
@@ -91,9 +91,7 @@ def _card(policy: Policy, repository: str) -> str:
 
 
 def _hub(command: str) -> Any:
-    try:
+    with needing("hub", command):
         import huggingface_hub
         import huggingface_hub.errors
-    except ImportError as error:
-        raise ConfigurationError(f"{command}: pip install 'midway[hub]'") from error
     return huggingface_hub

@@ -3,7 +3,7 @@
 import hashlib
 from typing import Any
 
-from midway.errors import ConfigurationError
+from midway.errors import needing
 from midway.runs.callbacks import Callback, Event
 
 
@@ -20,10 +20,8 @@ class Wandb:
     """
 
     def __init__(self, project: str) -> None:
-        try:
+        with needing("wandb", f"--wandb {project}"):
             import wandb
-        except ImportError as error:
-            raise ConfigurationError(f"--wandb {project}: pip install 'midway[wandb]'") from error
         self._wandb: Any = wandb
         self._project = project
         self._run: Any = None
