@@ -17,6 +17,8 @@ _PUBLIC = {
     "maze_env": "midway.configuration",
     "push": "midway.runs.hub",
     "pull": "midway.runs.hub",
+    "report": "midway.reports",
+    "watch": "midway.reports",
     "make_vec": "midway.envs.registry",
 }
 

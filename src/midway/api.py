@@ -23,7 +23,7 @@ from midway.training import loop, seeds, signals, state
 from midway.training.checkpoint import Checkpoints, steps_in
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.logging import Logger
-from midway.training.progress import Reporter, Silent, reporter
+from midway.training.progress import Reporter, Silent, reporter, stages_of
 from midway.training.state import Training
 
 
@@ -196,7 +196,9 @@ def evaluate(
     declared = loaded.config.declaration()
     task = task or declared.shown_task
     env = declared.factory(num_envs=episodes, task=task)
-    return run_episodes(env, loaded.actor(actions, seed), task, actions, seeds.evaluation(seed))
+    told = stages_of("steps of the episodes", loaded.spec.max_episode_steps)
+    start = seeds.evaluation(seed)
+    return run_episodes(env, loaded.actor(actions, seed), task, actions, start, told)
 
 
 def _chosen(folder: RunFolder, config: RunConfig, from_step: int | None) -> int | None:

@@ -109,7 +109,7 @@ def test_default_places(ris_run, copy_run, monkeypatch):
     asked = []
     monkeypatch.setattr(compose, "_write", lambda runs, out: asked.append(out) or [])
     run = copy_run(ris_run, "run")
-    report([run])
+    report(str(run))
     report([run, copy_run(ris_run, "other", seed=1)])
     assert asked == [run / "figures", run.parent / "report"]
 

@@ -300,7 +300,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
 }
 
 
-KEEPING = ("train", "resume", "sweep")
+KEEPING = ("train", "resume", "sweep", "tune")
 """Commands that end by a signal with a checkpoint; the others keep nothing."""
 
 

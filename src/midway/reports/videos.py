@@ -40,8 +40,8 @@ RENDERING = ("PYOPENGL_PLATFORM", "MUJOCO_GL")
 
 
 def watch(
-    path: Path,
-    out: Path | None = None,
+    path: str | Path,
+    out: str | Path | None = None,
     task: str | None = None,
     episodes: int = 1,
     seed: int = 0,
@@ -64,9 +64,9 @@ def watch(
     Raises:
         ConfigurationError: The folder, policy, task, number or file cannot be used.
     """
-    run = read(path, policy)
+    run = read(Path(path), policy)
     task = task or run.config.declaration().shown_task
-    out = out or run.folder.path / "videos" / f"{task}.mp4"
+    out = Path(out or run.folder.path / "videos" / f"{task}.mp4")
     if out.suffix not in RATES:
         raise ConfigurationError(f"{out}: a video is named {' or '.join(RATES)}")
     frames, rate = film(run, task, episodes, seed, RATES[out.suffix])
@@ -75,7 +75,7 @@ def watch(
 
 
 def show(
-    path: Path,
+    path: str | Path,
     task: str | None = None,
     episodes: int = 1,
     seed: int = 0,
@@ -93,7 +93,7 @@ def show(
     Raises:
         ConfigurationError: As in ``watch``, or there is no display here.
     """
-    run = read(path, policy)
+    run = read(Path(path), policy)
     task = task or run.config.declaration().shown_task
     check_display()
     frames, rate = film(run, task, episodes, seed, RATES[".mp4"])

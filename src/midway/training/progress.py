@@ -1,8 +1,9 @@
 """What is said on standard error while a run trains, or something else takes long."""
 
+import itertools
 import logging
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Protocol, cast, runtime_checkable
 
@@ -111,6 +112,18 @@ def reporter(total: int, done: int) -> Reporter:
 def stage(name: str, done: int, total: int) -> None:
     """Say how far a long action is that is no training."""
     STAGES.info("%s: %d of %d", name, done, total)
+
+
+def stages_of(name: str, steps: int) -> Callable[[], None]:
+    """Return what is called after each step, and says after every tenth part how far it is."""
+    taken = itertools.count(1)
+
+    def tell() -> None:
+        done = next(taken)
+        if done % max(1, steps // 10) == 0:
+            stage(name, done, steps)
+
+    return tell
 
 
 class _StageBar(logging.Handler):
