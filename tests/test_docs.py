@@ -19,6 +19,7 @@ from midway import presets, settings
 from midway.agents.registry import AGENTS
 from midway.cli.main import main
 from midway.envs.registry import ENVIRONMENTS
+from midway.spaces import SPACE, Choice, Range
 from midway.training.collect import EpisodeCounts
 from midway.training.logging import EVALUATION_COLUMNS
 from midway.types import Batch, DistanceTask, EnvSpec, Subgoal
@@ -37,7 +38,7 @@ SMALL = {
     "num_envs": 4,
     "random_steps": 40,
     "updates_per_step": 0.5,
-    "replay_capacity": 2_000,
+    "replay_capacity": 5_000,
     "evaluate_every": 60,
     "evaluation_episodes": 2,
     "log_every": 20,
@@ -180,3 +181,16 @@ def test_the_columns_of_every_run_are_on_the_page() -> None:
     assert said == {*EpisodeCounts().metrics(), *logged}
     text = (DOCS / "metrics.md").read_text().partition("## `evaluation.csv`")[2]
     assert set(EVALUATION_COLUMNS) <= set(names(text))
+
+
+def test_the_search_space_is_on_the_page() -> None:
+    said: dict[str, Range | Choice] = {}
+    for cell, low, high in table("tuning.md", "What is tried"):
+        for name in names(cell):
+            if high == "on":
+                said[name] = Choice((False, True))
+            elif high:
+                said[name] = Range(float(low), float(high), log=True)
+            else:
+                said[name] = Choice(tuple(int(value) for value in low.split(",")))
+    assert said == SPACE

@@ -13,6 +13,7 @@ from tyro.conf import Positional, arg
 
 from midway.cli.about import NOTHING, AboutEnv
 from midway.cli.parsing import Count, OptionalCount, parse, plain, settings
+from midway.cli.tuning import tune
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
 from midway.training.terminal import print_line
 
@@ -373,6 +374,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "resume": resume,
     "sweep": sweep,
+    "tune": tune,
     "evaluate": evaluate,
     "report": report,
     "watch": watch,
