@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-from midway.reports import compose, curves, style
+from midway.reports import comparison, compose, curves, style
 from midway.reports.cache import Cache
 from midway.reports.runs import by_environment, read
 from midway.reports.style import Picture
@@ -110,7 +110,7 @@ def find(stem: str, runs: list[Path], tables: Path) -> Picture | None:
     """Return the figure of this name in the report of these runs; nothing else is drawn."""
     environments = by_environment([read(path) for path in runs])
     of_each = (compose.pictures(one, Cache(tables)) for one in environments)
-    pictures = chain(curves.overview(environments), *of_each)
+    pictures = chain(curves.overview(environments), comparison.overview(environments), *of_each)
     return next((picture for picture in pictures if picture.stem == stem), None)
 
 

@@ -2,7 +2,8 @@
 
     python benchmarks/summary.py benchmarks/results/point-mazes
 
-Success is that of the last evaluation, lowest and highest of all seeds. Minutes are training time
+Success is that of the last evaluation: one seed, or the interquartile mean of several, with the
+95 % interval, which counts episodes and seeds (``midway.statistics``). Minutes are training time
 until an evaluation on the hard task first reached 95 % with the deterministic policy, of the
 slowest seed.
 """
@@ -12,6 +13,8 @@ import csv
 import json
 from collections import defaultdict
 from pathlib import Path
+
+from midway.statistics import of_agent
 
 Rows = list[dict[str, str]]
 
@@ -36,9 +39,11 @@ def main() -> None:
         steps = max(int(rows[-1]["step"]) for rows in runs)
         cells = [env, agent, precision, str(len(runs)), str(steps)]
         for task, actions in (("hard", "mean"), ("hard", "sampled"), ("uniform", "mean")):
-            last = [float(of(rows, task, actions)[-1]["success_rate"]) for rows in runs]
-            low, high = round(100 * min(last)), round(100 * max(last))
-            cells.append(f"{low} %" if low == high else f"{low}-{high} %")
+            last = [of(rows, task, actions)[-1] for rows in runs]
+            rates = [float(row["success_rate"]) for row in last]
+            success = of_agent(rates, [int(row["episodes"]) for row in last])
+            centre, low, high = (f"{100 * share:.0f}" for share in success)
+            cells.append(f"{centre} % [{low}, {high}]")
         print("| " + " | ".join([*cells, minutes(runs)]) + " |")
 
 

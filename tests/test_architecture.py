@@ -18,7 +18,7 @@ FILES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init
 FLOORS = (
     {"errors"},
     {"types", "files"},
-    {"settings", "functional", "tables", "agent"},
+    {"settings", "functional", "tables", "agent", "statistics"},
     {"networks", "replay", "envs", "planning"},
     {"agents"},
     {"training"},
@@ -147,7 +147,7 @@ LOOP = ["arrays", "collect", "evaluate", "freeze", "loop", "seeds", "state", "st
 def test_the_loop_knows_neither_agents_nor_environments(module):
     path = SOURCE.joinpath(*module.split(".")).with_suffix(".py")
     rooms = {target.split(".")[1] for target in imports_of(path) if target.startswith("midway.")}
-    containers = {"errors", "types", "files", "functional", "agent", "tables"}
+    containers = {"errors", "types", "files", "functional", "agent", "tables", "statistics"}
     assert rooms <= containers | {"replay", "training"}
 
 

@@ -17,7 +17,7 @@ from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteE
 from midway.runs import complete
 from midway.runs import policy as policies
 from midway.runs.folder import RunConfig, RunFolder, run_name
-from midway.runs.policy import Policy
+from midway.runs.policy import Policy, Which
 from midway.training import loop, seeds, signals, state
 from midway.training.checkpoint import Checkpoints, steps_in
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
@@ -218,13 +218,18 @@ def resume(
         return _run_locked(config, folder, setup, progress, number)
 
 
-def load(path: str | Path) -> Policy:
+def load(path: str | Path, policy: Which = "last") -> Policy:
     """Return the policy of a run: ``policy(observation, goal) -> action``.
 
+    Args:
+        path: The run folder.
+        policy: ``last``, ``best``, or an environment step whose policy was kept.
+
     Raises:
-        ConfigurationError: The folder holds no policy, or a damaged or foreign one.
+        ConfigurationError: The folder holds no such policy, or a damaged or foreign one.
     """
-    return policies.load(RunFolder(Path(path)))
+    folder = RunFolder.at(path)
+    return policies.load(folder, policies.weights_of(folder, policy))
 
 
 def evaluate(
@@ -234,6 +239,7 @@ def evaluate(
     task: str | None = None,
     actions: ActionKind = "mean",
     seed: int = 0,
+    policy: Which = "last",
 ) -> Evaluation:
     """Run episodes of a trained policy.
 
@@ -243,18 +249,19 @@ def evaluate(
         task: ``hard``, ``uniform`` or a named case of the environment; default: ``hard`` where
             there is one, else the environment's own starts and goals.
         actions: ``mean`` or ``sampled``.
-        seed: Seed of starts and goals.
+        seed: Seed of starts and goals, which no training meets.
+        policy: As in `load`.
 
     Raises:
-        ConfigurationError: The folder, the task or the number of episodes cannot be used.
+        ConfigurationError: The folder, policy, task or number of episodes cannot be used.
     """
     if episodes < 1:
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
-    policy = load(path)
-    declared = policy.config.declaration()
+    loaded = load(path, policy)
+    declared = loaded.config.declaration()
     task = task or declared.shown_task
     env = declared.factory(num_envs=episodes, task=task)
-    return run_episodes(env, policy.actor(actions, seed), task, actions, seeds.evaluation(seed))
+    return run_episodes(env, loaded.actor(actions, seed), task, actions, seeds.evaluation(seed))
 
 
 def setup_of(config: RunConfig, folder: RunFolder) -> state.Setup:
@@ -314,6 +321,15 @@ class RunSinks:
     def snapshot(self, training: Training) -> None:
         """Keep the weights of this step, for figures."""
         policies.keep(self._folder, self._config, training)
+
+    def is_better(self, result: Evaluation) -> bool:
+        """Return whether the lower end of its interval lies above that of the best policy."""
+        best = policies.best(self._folder)
+        return result.success.low > (0.0 if best is None else best.success.low)
+
+    def best(self, training: Training, confirmed: Evaluation) -> None:
+        """Keep the policy as the best."""
+        policies.keep_best(self._folder, self._config, training, confirmed)
 
     def checkpoint(self, training: Training) -> None:
         """Write a checkpoint and the policy.
@@ -392,6 +408,8 @@ def _run(
     if number is not None:
         training = state.restore(training, checkpoints, number)
         folder.note_resume(config)
+    else:
+        folder.best_weights.unlink(missing_ok=True)
     steps = training.counters.steps
     checkpoints.set_aside_after(steps)
     files = folder.metrics_file, folder.evaluation_file, folder.path / "events"
@@ -411,7 +429,7 @@ def _complete(training: Training, sinks: RunSinks, folder: RunFolder, asked: sig
     steps, train = training.counters.steps, training.setup.train
     if complete.policy_step(folder) != steps:
         sinks.policy(training)
-    due = loop.is_due(training, train.evaluate_every)
+    due = steps > 0 and loop.is_due(training, train.evaluate_every)
     if due and not complete.is_evaluated(folder, steps):
         loop.take_evaluation(training, sinks, {}, asked)
         asked.check()

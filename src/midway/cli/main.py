@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from midway.cli.about import NOTHING, AboutEnv
-from midway.cli.parsing import Count, OptionalCount, parse, plain, settings
+from midway.cli.compare import compare
+from midway.cli.parsing import Count, Kept, OptionalCount, parse, plain, run_folders, settings
 from midway.cli.tuning import tune
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
 from midway.training.terminal import print_line
@@ -121,6 +122,7 @@ def evaluate(
     task: str | None = None,
     actions: Literal["mean", "sampled"] = "mean",
     seed: int = 0,
+    policy: Kept = "last",
     json: bool = False,
 ) -> None:
     """Run episodes of a trained policy and print how many reach their goal.
@@ -131,11 +133,14 @@ def evaluate(
         task: hard, uniform, or a numbered case of the environment; default: hard, if there is one.
         actions: Mean or sampled actions.
         seed: Seed of starts and goals.
+        policy: The best policy of the run, the last, or that of a step whose policy was kept.
         json: Print one JSON object, with every episode.
     """
     from midway import api
 
-    result = api.evaluate(run, episodes=episodes, task=task, actions=actions, seed=seed)
+    result = api.evaluate(
+        run, episodes=episodes, task=task, actions=actions, seed=seed, policy=policy
+    )
     if json:
         episodes_json = [dataclasses.asdict(episode) for episode in result.episodes]
         _print_json(
@@ -144,7 +149,9 @@ def evaluate(
                 "task": result.task,
                 "actions": actions,
                 "seed": seed,
+                "policy": policy,
                 "success_rate": result.success_rate,
+                "interval": result.success[1:],
                 "final_distance": result.final_distance,
                 "episodes": episodes_json,
             }
@@ -152,7 +159,7 @@ def evaluate(
         return
     named = ", ".join(f"{name} {d:.3f} m" for name, d in result.final_distances.items())
     print(
-        f"{run}: {result.task}, {actions} actions: success {result.success_rate:.1%} of {episodes} "
+        f"{run}: {result.task}, {actions} actions: success {result.success:.1%} of {episodes} "
         f"episodes, {result.length:.1f} steps, {result.final_distance:.2f} m from the goal"
         + (f" ({named})" if named else "")
     )
@@ -213,16 +220,19 @@ def sweep(
     print(f"finished {out}")
 
 
-def report(runs: Positional[tuple[Path, ...]], out: Path | None = None) -> None:
+def report(
+    runs: Positional[tuple[Path, ...]], out: Path | None = None, policy: Kept = "last"
+) -> None:
     """Draw figures and one HTML page from run folders.
 
     Args:
         runs: Run folders, or the folder of a sweep.
         out: Folder for the figures; default: figures in the run folder, or report beside the first.
+        policy: The policies that are drawn: best, last, or those of a step.
     """
     from midway import reports
 
-    for path in reports.report(_run_folders(runs), out):
+    for path in reports.report(run_folders(runs), out, policy):
         print(path)
 
 
@@ -232,6 +242,7 @@ def watch(
     task: str | None = None,
     episodes: Count = 1,
     seed: int = 0,
+    policy: Kept = "last",
     live: bool = False,
 ) -> None:
     """Write a video of the policy with its imagined subgoals, or show it in a window.
@@ -242,6 +253,7 @@ def watch(
         task: hard, uniform, or a numbered case of the environment; default: hard, if there is one.
         episodes: Number of episodes.
         seed: Seed of starts and goals.
+        policy: The best policy of the run, the last, or that of a step whose policy was kept.
         live: Show the episodes in a window instead; needs a display.
     """
     from midway import reports
@@ -249,9 +261,9 @@ def watch(
     if live:
         if out is not None:
             raise ConfigurationError(f"--out {out}: --live writes no file")
-        reports.show(run, task=task, episodes=episodes, seed=seed)
+        reports.show(run, task=task, episodes=episodes, seed=seed, policy=policy)
         return
-    print(reports.watch(run, out, task=task, episodes=episodes, seed=seed))
+    print(reports.watch(run, out, task=task, episodes=episodes, seed=seed, policy=policy))
 
 
 def bench(
@@ -377,6 +389,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "tune": tune,
     "evaluate": evaluate,
     "report": report,
+    "compare": compare,
     "watch": watch,
     "bench": bench,
     "envs": envs,
@@ -422,15 +435,6 @@ def _fail(status: int, error: object) -> None:
     text = " ".join(str(error).split())
     print_line(f"midway: {text}")
     sys.exit(status)
-
-
-def _run_folders(paths: Sequence[Path]) -> list[Path]:
-    """Return the paths, with the folder of a sweep replaced by its runs."""
-    found: list[Path] = []
-    for path in paths:
-        below = sorted(config.parent for config in path.glob("*/config.json"))
-        found += below if below and not (path / "config.json").exists() else [path]
-    return found
 
 
 def _print_json(value: object) -> None:

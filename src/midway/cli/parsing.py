@@ -6,7 +6,8 @@ import functools
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, ParamSpec
+from pathlib import Path
+from typing import Annotated, Literal, ParamSpec
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
@@ -35,6 +36,8 @@ Count = Annotated[int, _NUMBER]
 """A whole number, which may be written 1e6 or 1_000_000."""
 OptionalCount = Annotated[int | None, _NUMBER]
 """A whole number, or what the preset or the run says."""
+Kept = Literal["best", "last"] | Count
+"""A policy of a run."""
 
 
 def parse(
@@ -96,6 +99,15 @@ def settings(words: Sequence[str]) -> dict[str, str]:
             raise ConfigurationError(f"--set {word!r}: write NAME=VALUE")
         changes[name.replace("-", "_")] = value
     return changes
+
+
+def run_folders(paths: Sequence[Path]) -> list[Path]:
+    """Return the paths, with the folder of a sweep replaced by its runs."""
+    found: list[Path] = []
+    for path in paths:
+        below = sorted(config.parent for config in path.glob("*/config.json"))
+        found += below if below and not (path / "config.json").exists() else [path]
+    return found
 
 
 def plain(value: object) -> object:

@@ -16,6 +16,7 @@ from midway.errors import ConfigurationError
 from midway.runs import complete
 from midway.runs.folder import RunFolder, run_name
 from midway.settings import changed, split
+from midway.statistics import Estimate, of_policy
 
 State: TypeAlias = Literal["waiting", "running", "finished", "failed", "stopped"]
 
@@ -192,13 +193,14 @@ def last_line(folder: Path, job: Job) -> str:
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
-def last_success(evaluation: Path) -> tuple[int | None, float | None]:
+def last_success(evaluation: Path) -> tuple[int | None, Estimate | None]:
     """Return step and success of the last evaluation: mean actions, ``hard`` if it is there."""
     try:
         table = tables.read(evaluation)
         last = (table["actions"] == "mean") & (table["step"] == table["step"].max())
         hard = last & (table["task"] == "hard")
         row = np.flatnonzero(hard if hard.any() else last)[0]
-        return int(table["step"][row]), float(table["success_rate"][row])
+        success = of_policy(table["success_rate"][row], table["episodes"][row])
+        return int(table["step"][row]), success
     except (ConfigurationError, KeyError, IndexError, ValueError):
         return None, None

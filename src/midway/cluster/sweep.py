@@ -29,6 +29,7 @@ from midway.cluster.jobs import (
 )
 from midway.errors import ConfigurationError
 from midway.runs.folder import RunFolder
+from midway.statistics import Estimate
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -42,14 +43,15 @@ class Status:
         job: The run.
         state: Whether it waits, runs, is finished or has failed.
         step: Environment steps at its last evaluation.
-        success: Its success on the hard task (uniform where there is none), mean actions.
+        success: Its success on the hard task (uniform where there is none), mean actions, with the
+            95 % interval.
         reason: The last line of its log, where it has failed.
     """
 
     job: Job
     state: State
     step: int | None
-    success: float | None
+    success: Estimate | None
     reason: str = ""
 
 

@@ -110,7 +110,7 @@ class Study:
         Raises:
             ConfigurationError: It is damaged or foreign.
         """
-        return policies.load(self.run.folder)
+        return policies.load(self.run.folder, self.run.weights)
 
     @property
     def maze(self) -> Maze:
@@ -209,7 +209,7 @@ class Study:
         return self._table("values", compute)
 
     def _policy_of(self, weights: Path) -> Policy:
-        if weights == self.run.folder.policy_weights:
+        if weights == self.run.weights:
             return self.policy
         return policies.load(self.run.folder, weights)
 
@@ -218,7 +218,7 @@ class Study:
         past = self.run.past_weights
         chosen = np.linspace(0, len(past) - 1, min(len(past), SNAPSHOTS - 1)).round().astype(int)
         earlier = {step: past[step] for step in np.array(list(past))[chosen].tolist()}
-        return {**earlier, self.run.policy_step: self.run.folder.policy_weights}
+        return {**earlier, self.run.policy_step: self.run.weights}
 
     def _counts(self) -> dict[str, int]:
         """Return the number of episodes of each task: more where they are short."""
@@ -247,7 +247,7 @@ class Study:
     def _table(self, name: str, compute: Callable[[], Table], *weights: Path) -> Table:
         """Return a table from its file, or compute it and write the file."""
         digest = hashlib.sha256(f"{VERSION} {SEED} {self.maze}".encode())
-        for file in (self.run.folder.policy_weights, *weights):
+        for file in (self.run.weights, *weights):
             digest.update(file.read_bytes())
         path = self._folder / f"{self.run.name}-{digest.hexdigest()[:10]}-{name}.csv"
         if not path.exists():

@@ -5,11 +5,23 @@ from pathlib import Path
 from typing import TypeAlias
 
 from midway.errors import ConfigurationError
-from midway.reports import curves, difficulty, health, images, imagined, maze, page, style, tabletop
+from midway.reports import (
+    comparison,
+    curves,
+    difficulty,
+    health,
+    images,
+    imagined,
+    maze,
+    page,
+    style,
+    tabletop,
+)
 from midway.reports.cache import Cache
 from midway.reports.page import Section, Shown
 from midway.reports.runs import RunData, Runs, by_environment, read
 from midway.reports.style import Picture
+from midway.runs.policy import Which
 
 PAGE = "report.html"
 TABLES = "data"
@@ -19,6 +31,7 @@ Figures: TypeAlias = Callable[[Runs, Cache], Iterator[Picture]]
 
 FIGURES: tuple[Figures, ...] = (
     curves.figures,
+    comparison.figures,
     maze.figures,
     difficulty.figures,
     imagined.figures,
@@ -29,13 +42,15 @@ FIGURES: tuple[Figures, ...] = (
 """Every figure of an environment, in the order of the page."""
 
 
-def report(paths: Sequence[Path], out: Path | None = None) -> list[Path]:
+def report(paths: Sequence[Path], out: Path | None = None, policy: Which = "last") -> list[Path]:
     """Draw what run folders hold, and one page with all of it.
 
     Args:
         paths: Run folders; agents, seeds and environments may differ.
         out: Where the files go; default: ``figures`` in the run's folder, or for several runs
             ``report`` beside the first one.
+        policy: Whose episodes, subgoals and values are drawn: ``last``, ``best``, or a step whose
+            policy was kept.
 
     Returns:
         The files that were written: the page, then the figures.
@@ -46,7 +61,7 @@ def report(paths: Sequence[Path], out: Path | None = None) -> list[Path]:
     if not paths:
         raise ConfigurationError("no run folder given")
     folders = {path.resolve(): path for path in paths}
-    runs = [read(path) for path in folders.values()]
+    runs = [read(path, policy) for path in folders.values()]
     if out is None:
         out = runs[0].folder.figures if len(runs) == 1 else paths[0].resolve().parent / "report"
     try:
@@ -64,7 +79,10 @@ def pictures(runs: Runs, cache: Cache) -> Iterator[Picture]:
 
 def _write(found: Sequence[RunData], out: Path) -> list[Path]:
     environments = by_environment(found)
-    overview = _drawn(curves.overview(environments), out)
+    overview = [
+        *_drawn(curves.overview(environments), out),
+        *_drawn(comparison.overview(environments), out),
+    ]
     sections = [_section(runs, out) for runs in environments]
     html = page.write(out / PAGE, sections, overview)
     shown = [*overview, *(picture for section in sections for picture in section.pictures)]

@@ -15,8 +15,8 @@ from midway.envs.views import TableView
 from midway.reports import style
 from midway.reports.cache import Cache
 from midway.reports.runs import Group, Runs
-from midway.reports.statistics import Curve, Run, curve
 from midway.reports.style import Picture, thousands
+from midway.statistics import Curve, Series, curve
 from midway.tables import Table
 
 Column: TypeAlias = Float[np.ndarray, " rows"]
@@ -25,6 +25,11 @@ TASKS = {"hard": "hard task", "uniform": "uniform tasks"}
 LineStyle: TypeAlias = str | tuple[int, tuple[int | float, ...]]
 LINES: dict[str, LineStyle] = {"mean": "-", "sampled": (0, (2, 1.5))}
 """Solid lines for the deterministic policy, dashed ones for sampled actions."""
+
+SUCCESS = "success_rate"
+
+STAR = "*"
+"""Mark of the best policy."""
 
 NAMES = {"mean": "deterministic policy", "sampled": "sampled actions"}
 
@@ -51,9 +56,11 @@ def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
         lambda: draw(runs),
         "Learning curves",
         "Success over environment steps (top) and over the time spent on collection and updates, "
-        "without evaluations (bottom). Lines: one seed, or the interquartile mean of several; "
-        "shaded: its 95 % bootstrap interval. Over time, seeds are compared along straight lines "
-        "between their evaluations, and a seed that is done keeps its last success.",
+        "without evaluations (bottom). Lines: one seed, or the interquartile mean of several, each "
+        "of which has a thin line; shaded: the 95 % interval, which counts episodes and seeds. A "
+        "star is the best policy of a seed, at its success on the episodes that confirmed it. Over "
+        "time, seeds are compared along straight lines between their evaluations, and a seed that "
+        "is done keeps its last success.",
         f"Learning curves on {runs.env}. Last success: "
         + "; ".join(
             f"{group.label} hard {success_text(group, 'hard')}, "
@@ -81,8 +88,8 @@ def overview(environments: Sequence[Runs]) -> Iterator[Picture]:
             lambda: draw_overview(environments),
             "All environments",
             "Success of the deterministic policy over environment steps, interquartile mean over "
-            "seeds with stratified 95 % bootstrap intervals; all environments together where they "
-            "have the same agents.",
+            "seeds with 95 % intervals that count episodes and seeds; all environments together "
+            "where they have the same agents.",
             "Learning curves of every environment.",
         )
 
@@ -103,6 +110,8 @@ def draw(runs: Runs) -> Figure:
             if clock == "step":
                 panel.xaxis.set_major_formatter(thousands)
     kinds = [_line(style.MUTED, NAMES[actions], line) for actions, line in LINES.items()]
+    if any(run.best for group in runs.groups for run in group.runs):
+        kinds.append(_line(style.MUTED, "best policy", "", marker=STAR, markersize=9))
     style.legend_below(figure, _group_entries(runs.groups) + kinds)
     return figure
 
@@ -139,9 +148,9 @@ def _together(environments: Sequence[Runs], task: str) -> Iterator[tuple[Group, 
     """Yield the curve over all environments of every label that all of them have."""
     for first in environments[0].groups:
         same = [g for runs in environments for g in runs.groups if g.label == first.label]
-        strata = [_series(group, task, "mean", "step") for group in same]
+        strata = [series(group, task, "mean", "step") for group in same]
         if len(same) == len(environments) and all(strata):
-            steps = np.unique(np.concatenate([x for runs in strata for x, _ in runs]))
+            steps = np.unique(np.concatenate([run.x for runs in strata for run in runs]))
             yield first, curve(strata, steps)
 
 
@@ -151,7 +160,7 @@ def success_curve(group: Group, task: str, actions: str, clock: str) -> Curve | 
     Over minutes seeds differ in speed: the curve begins when all have been evaluated, and a seed
     that is done keeps its last success.
     """
-    return _curve(_series(group, task, actions, clock), clock)
+    return _curve(series(group, task, actions, clock), clock)
 
 
 def success_text(group: Group, task: str, actions: str = "mean") -> str:
@@ -160,11 +169,8 @@ def success_text(group: Group, task: str, actions: str = "mean") -> str:
     if drawn is None or not len(drawn.x):
         return "not evaluated"
     last = int((drawn.runs == drawn.runs.max()).nonzero()[0][-1])
-    text = style.percent(drawn.centre[last])
-    if drawn.runs[last] > 1:
-        low, high = (style.percent(end[last]) for end in drawn.interval)
-        text += f" [{low}, {high}]"
-    return text
+    low, high = (style.percent(end[last]) for end in drawn.interval)
+    return f"{style.percent(drawn.centre[last])} [{low}, {high}]"
 
 
 def distances(runs: Runs) -> list[str]:
@@ -182,8 +188,8 @@ def draw_distances(runs: Runs) -> Figure:
     for panel, (task, title) in zip(axes, TASKS.items(), strict=True):
         for group in runs.groups:
             for name, line in lines.items():
-                series = _series(group, task, "mean", "step", DISTANCE + name)
-                if (drawn := _curve(series, "step")) is not None:
+                found = series(group, task, "mean", "step", DISTANCE + name)
+                if (drawn := _curve(found, "step")) is not None:
                     _draw_curve(panel, group, "mean", drawn, line)
         style.label(panel, f"Distance at the end, {title}", "environment steps", "m")
         panel.set_ylim(bottom=0)
@@ -198,35 +204,41 @@ def draw_distances(runs: Runs) -> Figure:
     return figure
 
 
-def _curve(series: list[Run], clock: str) -> Curve | None:
+def _curve(found: list[Series], clock: str) -> Curve | None:
     """Return the curve of several runs; None if there are none."""
-    if not series:
+    if not found:
         return None
-    places = np.unique(np.concatenate([x for x, _ in series]))
-    if clock != "step" and len(series) > 1:
-        places = np.linspace(max(x[0] for x, _ in series), places[-1], TIME_POINTS)
-    return curve([series], places)
+    places = np.unique(np.concatenate([run.x for run in found]))
+    if clock != "step" and len(found) > 1:
+        places = np.linspace(max(run.x[0] for run in found), places[-1], TIME_POINTS)
+    return curve([found], places)
 
 
-def _series(
-    group: Group, task: str, actions: str, clock: str, column: str = "success_rate"
-) -> list[Run]:
+def series(
+    group: Group, task: str, actions: str, clock: str, column: str = SUCCESS
+) -> list[Series]:
     """Return success, or another column, of every run that has been evaluated."""
     tables = [(run, run.evaluated(task, actions)) for run in group.runs]
-    series = [
-        (run, _clock(table, clock), table[column])
+    found = [
+        (run, Series(_clock(table, clock), table[column], _counted(table, column)))
         for run, table in tables
         if column in table and len(table["step"])
     ]
-    last = max((x[-1] for _, x, _ in series), default=0.0)
+    last = max((points.x[-1] for _, points in found), default=0.0)
     return [
-        _kept(x, y, last) if run.finished and clock != "step" else (x, y) for run, x, y in series
+        _kept(points, last) if run.finished and clock != "step" else points for run, points in found
     ]
 
 
-def _kept(x: Column, y: Column, last: float) -> Run:
+def _counted(table: Table, column: str) -> Column | None:
+    """Return the episodes of each success rate; nothing for other columns."""
+    return table.get("episodes") if column == SUCCESS else None
+
+
+def _kept(run: Series, last: float) -> Series:
     """Return a run that keeps its last success until ``last``."""
-    return np.append(x, max(last, x[-1])), np.append(y, y[-1])
+    episodes = None if run.episodes is None else np.append(run.episodes, run.episodes[-1])
+    return Series(np.append(run.x, max(last, run.x[-1])), np.append(run.y, run.y[-1]), episodes)
 
 
 def _clock(table: Table, clock: str) -> Column:
@@ -235,14 +247,36 @@ def _clock(table: Table, clock: str) -> Column:
 
 def _draw_group(axes: Axes, group: Group, task: str, actions: str, clock: str) -> None:
     drawn = success_curve(group, task, actions, clock)
-    if drawn is not None:
-        _draw_curve(axes, group, actions, drawn)
+    if drawn is None:
+        return
+    _draw_curve(axes, group, actions, drawn)
+    if actions == "mean":
+        _draw_seeds(axes, group, task, clock)
+        _draw_best(axes, group, task, clock)
+
+
+def _draw_seeds(axes: Axes, group: Group, task: str, clock: str) -> None:
+    """Draw a thin line for each of several seeds."""
+    found = series(group, task, "mean", clock)
+    for run in found if len(found) > 1 else ():
+        axes.plot(run.x, run.y, color=group.colour, linewidth=0.7, alpha=0.45, zorder=1.5)
+
+
+def _draw_best(axes: Axes, group: Group, task: str, clock: str) -> None:
+    """Mark the best policy of each seed, where it was evaluated on this task."""
+    for run in group.runs:
+        table, best = run.evaluated(task, "mean"), run.best
+        if best is None or best.task != task or not table:
+            continue
+        places = _clock(table, clock)[table["step"] == best.step]
+        look: style.Look = {"markersize": 11, "markeredgecolor": "white", "zorder": 3}
+        axes.plot(places, len(places) * [best.success.centre], STAR, color=group.colour, **look)
 
 
 def _draw_curve(
     axes: Axes, group: Group, actions: str, drawn: Curve, line: LineStyle | None = None
 ) -> None:
-    """Draw the line; for the deterministic policy also marks, and the interval of several runs."""
+    """Draw the line; for the deterministic policy also marks, and the interval."""
     axes.plot(
         drawn.x,
         drawn.centre,
@@ -253,7 +287,7 @@ def _draw_curve(
         markersize=4,
         markevery=max(1, len(drawn.x) // MARKS),
     )
-    if actions == "mean" and len(drawn.x) and drawn.runs.max() > 1:
+    if actions == "mean":
         band = drawn.interval
         axes.fill_between(drawn.x, band.low, band.high, color=group.colour, alpha=0.18, lw=0)
 

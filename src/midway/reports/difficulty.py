@@ -13,8 +13,8 @@ from midway.envs.views import MazeView
 from midway.reports import style
 from midway.reports.cache import Cache, Episode
 from midway.reports.runs import Group, Runs
-from midway.reports.statistics import bootstrap, interquartile_mean, wilson
 from midway.reports.style import Picture
+from midway.statistics import Estimate, of_agent
 
 BINS = 6
 """Bins of geodesic distance."""
@@ -42,8 +42,8 @@ def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
         lambda: draw(results, cases),
         "Success against difficulty",
         "The saved deterministic policies, with the same starts and goals for all. Each bin of "
-        "uniform tasks holds as many episodes. Bars: 95 % intervals, over seeds by bootstrap; of "
-        "a single seed over its episodes (Wilson).",
+        "uniform tasks holds as many episodes. Bars: 95 % intervals, which count seeds and "
+        "episodes (bootstrap), or the episodes of a single seed (Wilson).",
         f"Success on {runs.env} by length of the shortest path"
         + (" and by numbered case." if cases else "."),
     )
@@ -74,20 +74,9 @@ def bins(episodes: Sequence[Episode]) -> Int[np.ndarray, " episodes"]:
     return np.asarray(rank * BINS // len(episodes))
 
 
-def summary(
-    successes: Sequence[Bool[np.ndarray, " episodes"]],
-) -> tuple[float, float, float]:
-    """Return success with the ends of its 95 % interval.
-
-    Of several seeds: interquartile mean and bootstrap interval of their rates. Of one seed: its
-    rate and the Wilson interval of its episodes.
-    """
-    if len(successes) == 1:
-        low, high = wilson(int(successes[0].sum()), len(successes[0]))
-        return float(successes[0].mean()), low, high
-    rates = np.array([[seed.mean()] for seed in successes])
-    interval = bootstrap([rates], np.random.default_rng(0))
-    return float(interquartile_mean(rates)[0]), float(interval.low[0]), float(interval.high[0])
+def summary(successes: Sequence[Bool[np.ndarray, " episodes"]]) -> Estimate:
+    """Return the success of seeds on the same episodes, with its interval."""
+    return of_agent([float(seed.mean()) for seed in successes], [len(seed) for seed in successes])
 
 
 def _draw_bins(axes: Axes, results: Mapping[str, tuple[Group, Seeds]]) -> None:

@@ -15,7 +15,9 @@ from midway.envs import registry as environments
 from midway.envs.views import View
 from midway.errors import ConfigurationError
 from midway.reports import style
+from midway.runs import policy as policies
 from midway.runs.folder import RunConfig, RunFolder, read_json, run_name
+from midway.runs.policy import Best, Which
 from midway.tables import Table
 from midway.training.arrays import checked_arrays
 from midway.types import JsonObject
@@ -45,6 +47,7 @@ class RunData:
         metrics: Scalars of training; no columns before the first row.
         evaluation: Evaluations; no columns before the first row.
         damaged: What cannot be read, in words; it is treated as if it were not there.
+        which: The policy that is looked at.
     """
 
     folder: RunFolder
@@ -53,6 +56,7 @@ class RunData:
     metrics: Table
     evaluation: Table
     damaged: tuple[str, ...] = ()
+    which: Which = "last"
 
     @property
     def steps(self) -> int:
@@ -71,8 +75,26 @@ class RunData:
         return self.folder.policy_weights.exists() and self.folder.policy_config.exists()
 
     @property
+    def weights(self) -> Path:
+        """The weights of the policy.
+
+        Raises:
+            ConfigurationError: They were not kept.
+        """
+        return policies.weights_of(self.folder, self.which)
+
+    @property
+    def best(self) -> Best | None:
+        """How good the best policy is, if one was kept."""
+        return policies.best(self.folder)
+
+    @property
     def policy_step(self) -> int:
         """The step that the policy was saved at, or that of the newest checkpoint."""
+        if isinstance(self.which, int):
+            return self.which
+        if self.which == "best" and self.best is not None:
+            return self.best.step
         with suppress(ConfigurationError):  # whoever loads the policy says what is wrong
             step = read_json(self.folder.policy_config).get("step")
             if isinstance(step, int):
@@ -84,7 +106,8 @@ class RunData:
     @property
     def past_weights(self) -> dict[int, Path]:
         """Weights that were kept before the policy was saved, by step."""
-        steps = {step: file for step, file in _kept(self.folder).items() if not _damage(file)}
+        kept = policies.snapshots(self.folder)
+        steps = {step: file for step, file in kept.items() if not _damage(file)}
         return {step: steps[step] for step in sorted(steps) if step < self.policy_step}
 
     @property
@@ -159,21 +182,25 @@ class Runs:
         return self.groups[0].runs[0].view
 
 
-def read(path: Path) -> RunData:
+def read(path: Path, policy: Which = "last") -> RunData:
     """Return what is in a run folder.
+
+    Args:
+        path: The run folder.
+        policy: The policy that is looked at.
 
     Raises:
         ConfigurationError: It is no run folder, or its configuration is damaged or of another
             version.
     """
-    folder = RunFolder(path)
+    folder = RunFolder.at(path)
     config = folder.load_config()
     record = read_json(folder.config_file)
     metrics, wrong = _table(folder.metrics_file, METRICS)
     evaluation, wrong_too = _table(folder.evaluation_file, EVALUATION)
-    kept = [_damage(file) for file in _kept(folder).values()]
+    kept = [_damage(file) for file in policies.snapshots(folder).values()]
     damaged = tuple(text for text in (wrong, wrong_too, *kept) if text)
-    return RunData(folder, config, record, metrics, evaluation, damaged)
+    return RunData(folder, config, record, metrics, evaluation, damaged, policy)
 
 
 def _table(path: Path, columns: Sequence[str]) -> tuple[Table, str]:
@@ -186,12 +213,6 @@ def _table(path: Path, columns: Sequence[str]) -> tuple[Table, str]:
     if found and missing:
         return {}, f"{path} is damaged: it has no columns {', '.join(missing)}"
     return found, ""
-
-
-def _kept(folder: RunFolder) -> dict[int, Path]:
-    """Return the weights that were kept, by step."""
-    names = {file.stem.removeprefix("step-"): file for file in folder.past_policies.glob("step-*")}
-    return {int(n): f for n, f in names.items() if n.isdigit() and f.suffix == ".safetensors"}
 
 
 def _damage(weights: Path) -> str:

@@ -18,6 +18,7 @@ from midway.reports.recordings import Recording, record
 from midway.reports.runs import RunData, agent_labels, read
 from midway.reports.scenes import Frame, Scene
 from midway.runs import policy as policies
+from midway.runs.policy import Which
 
 SECONDS = 8
 """How long a long episode takes in the video; short ones are shown at the lowest rate."""
@@ -43,6 +44,7 @@ def watch(
     task: str | None = None,
     episodes: int = 1,
     seed: int = 0,
+    policy: Which = "last",
 ) -> Path:
     """Write a video of a trained policy, which acts deterministically.
 
@@ -53,14 +55,15 @@ def watch(
             is one.
         episodes: Number of episodes, one after the other.
         seed: Seed of starts and goals.
+        policy: ``last``, ``best``, or a step whose policy was kept.
 
     Returns:
         The file.
 
     Raises:
-        ConfigurationError: The folder, task, number or file cannot be used.
+        ConfigurationError: The folder, policy, task, number or file cannot be used.
     """
-    run = read(path)
+    run = read(path, policy)
     task = task or run.config.declaration().shown_task
     out = out or run.folder.path / "videos" / f"{task}.mp4"
     if out.suffix not in RATES:
@@ -70,7 +73,13 @@ def watch(
     return out
 
 
-def show(path: Path, task: str | None = None, episodes: int = 1, seed: int = 0) -> None:
+def show(
+    path: Path,
+    task: str | None = None,
+    episodes: int = 1,
+    seed: int = 0,
+    policy: Which = "last",
+) -> None:
     """Show the same in a window, until the last episode has ended or the window is closed.
 
     Args:
@@ -78,11 +87,12 @@ def show(path: Path, task: str | None = None, episodes: int = 1, seed: int = 0) 
         task: As in ``watch``.
         episodes: As in ``watch``.
         seed: As in ``watch``.
+        policy: As in ``watch``.
 
     Raises:
         ConfigurationError: As in ``watch``, or there is no display here.
     """
-    run = read(path)
+    run = read(path, policy)
     task = task or run.config.declaration().shown_task
     check_display()
     frames, rate = film(run, task, episodes, seed, RATES[".mp4"])
@@ -99,7 +109,7 @@ def film(
     """
     if episodes < 1:
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
-    policy = policies.load(run.folder)
+    policy = policies.load(run.folder, run.weights)
     (label,) = agent_labels([run.config.agent])
     title = f"{label} on {run.config.env}, {task}"
     make = scenes.maker(run.folder, policy, title)

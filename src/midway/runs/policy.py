@@ -1,11 +1,12 @@
 """Saved policies: weights and a description that others can load."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from midway.agent import AgentState, AnyAgent, Encoder, Inputs, Memory, SubgoalDistribution
 from midway.agents import registry
+from midway.envs import own_spaces
 from midway.errors import ConfigurationError
 from midway.runs.folder import (
     FORMAT,
@@ -24,15 +26,35 @@ from midway.runs.folder import (
     read_json,
     write_json,
 )
+from midway.statistics import Estimate, of_policy
 from midway.training import acting, freeze
 from midway.training.acting import Seen
-from midway.training.arrays import array_names, load_arrays, networks_of, save_arrays
-from midway.training.evaluate import ActionKind
+from midway.training.arrays import array_names, load_arrays, networks_of, said_of, save_arrays
+from midway.training.evaluate import ActionKind, Evaluation
 from midway.training.state import FROZEN, Training
 from midway.training.step import create_state
 from midway.types import AnyArray, EnvSpec, JsonObject, NumPyArray
 
 Found = TypeVar("Found")
+
+
+Which: TypeAlias = Literal["best", "last"] | int
+"""A policy of a run: the best, the last, or that of a step whose weights were kept."""
+
+
+@dataclass(frozen=True)
+class Best:
+    """How good the best policy of a run was on the episodes that confirmed it.
+
+    Attributes:
+        step: The environment step that it is of.
+        task: What starts and goals were drawn from.
+        success: Its success with deterministic actions.
+    """
+
+    step: int
+    task: str
+    success: Estimate
 
 
 @dataclass(frozen=True)
@@ -72,6 +94,38 @@ class Policy:
     def sample(self, observation: Seen, goal: Seen, key: Key[Array, ""]) -> NumPyArray:
         """Return sampled actions ``(B, action_dim)`` for batches."""
         return self._act(observation, goal, key, explore=True)
+
+    def predict(
+        self,
+        observation: Mapping[str, object],
+        deterministic: bool = True,
+        seed: int | None = None,
+    ) -> NumPyArray:
+        """Return the action for what the environment itself observes, as it takes actions.
+
+        An agent that remembers its episode (TDM, LEAP) acts as in the first step of one; `actor`
+        remembers.
+
+        Args:
+            observation: The environment's dictionary of ``observation``, ``achieved_goal`` and
+                ``desired_goal``, or of batches of B of each.
+            deterministic: Whether the action is the mean one, else a sampled one.
+            seed: Seed of a sampled action; default: another draw on each call.
+
+        Returns:
+            One action, with shape, bounds and type of the environment's action space, or
+            ``(B, ...)`` of them for batches.
+
+        Raises:
+            ConfigurationError: An entry is missing or has another shape, or the environment is not
+                midway's and cannot be made here.
+        """
+        foreign = self.config.declaration().foreign
+        states, goals, single = own_spaces.seen(self.spec, foreign, observation)
+        drawn = np.random.SeedSequence(seed).generate_state(1)[0]
+        actions = self._act(states, goals, jax.random.key(int(drawn)), explore=not deterministic)
+        own = own_spaces.in_own_bounds(foreign, actions)
+        return own[0] if single else own
 
     def actor(self, actions: ActionKind = "mean", seed: int = 0) -> acting.Actor:
         """Return the policy as one that remembers its episodes, from their first step on.
@@ -172,10 +226,35 @@ def keep(folder: RunFolder, config: RunConfig, training: Training) -> None:
     _save_weights(folder.past_policies / name, folder.identity(config), training)
 
 
-def _save_weights(path: Path, run: str, training: Training) -> None:
+def keep_best(
+    folder: RunFolder, config: RunConfig, training: Training, confirmed: Evaluation
+) -> None:
+    """Write the weights to ``policies/best.safetensors``, with what confirmed them."""
+    folder.past_policies.mkdir(exist_ok=True)
+    _save_weights(
+        folder.best_weights,
+        folder.identity(config),
+        training,
+        task=confirmed.task,
+        success_rate=confirmed.success_rate,
+        episodes=len(confirmed.episodes),
+    )
+
+
+def best(folder: RunFolder) -> Best | None:
+    """Return how good the best policy is; None if none was kept, or its file is damaged."""
+    try:
+        said = said_of(folder.best_weights)
+        success = of_policy(said["success_rate"], said["episodes"])
+        return Best(said["step"], said["task"], success)
+    except (ConfigurationError, KeyError):
+        return None
+
+
+def _save_weights(path: Path, run: str, training: Training, **about: object) -> None:
     networks = networks_of(training.state, training.setup.agent.networks)
-    about = {"run": run, "step": training.counters.steps}
-    save_arrays(path, networks | _frozen(training.encoder), about)
+    said = {"run": run, "step": training.counters.steps, **about}
+    save_arrays(path, networks | _frozen(training.encoder), said)
 
 
 def _frozen(encoder: Encoder | None) -> dict[str, PyTree]:
@@ -183,12 +262,50 @@ def _frozen(encoder: Encoder | None) -> dict[str, PyTree]:
     return {} if encoder is None else {FROZEN: eqx.filter(encoder, eqx.is_array)}
 
 
+def weights_of(folder: RunFolder, which: Which = "last") -> Path:
+    """Return the file of a policy's weights.
+
+    Raises:
+        ConfigurationError: It was not kept; the text names what there is.
+    """
+    if which == "last":
+        return folder.policy_weights
+    if which == "best":
+        if folder.best_weights.exists():
+            return folder.best_weights
+        raise ConfigurationError(
+            f"run folder {folder.path}: no best policy: no evaluation has reached a goal yet, or "
+            "an earlier version trained it"
+        )
+    kept = {**snapshots(folder), **{step: file for file, step in _named(folder)}}
+    if which not in kept:
+        there = ", ".join(map(str, sorted(kept))) or "none"
+        raise ConfigurationError(
+            f"run folder {folder.path}: no policy of step {which} was kept: there are {there}"
+        )
+    return kept[which]
+
+
+def _named(folder: RunFolder) -> Iterator[tuple[Path, int]]:
+    """Yield the files that are called the best and the last, with the steps that they are of."""
+    for file in (folder.best_weights, folder.policy_weights):
+        with suppress(ConfigurationError):
+            if "step" in (said := said_of(file)):
+                yield file, said["step"]
+
+
+def snapshots(folder: RunFolder) -> dict[int, Path]:
+    """Return the weights that were kept on the way, by step."""
+    names = {file.stem.removeprefix("step-"): file for file in folder.past_policies.glob("step-*")}
+    return {int(n): f for n, f in names.items() if n.isdigit() and f.suffix == ".safetensors"}
+
+
 def load(folder: RunFolder, weights: Path | None = None) -> Policy:
     """Return the policy of a run folder; no environment is made.
 
     Args:
         folder: The run folder.
-        weights: A snapshot of its weights instead of the newest.
+        weights: Other weights than the newest: a file that `weights_of` returned.
 
     Raises:
         ConfigurationError: The folder holds no policy, or a damaged one.
@@ -196,7 +313,8 @@ def load(folder: RunFolder, weights: Path | None = None) -> Policy:
     description, config, spec = _described(folder)
     agent = registry.get(config.agent)
     state = create_state(agent, config.hyperparameters, spec, jax.random.key(0))
-    path, encoder = weights or folder.policy_weights, None
+    newest = folder.policy_weights
+    path, encoder = weights or newest, None
     if agent.freezing and any(name.startswith(FROZEN) for name in array_names(path)):
         encoder = agent.freezing.encoder(state)
         features = freeze.encoded_spec(spec, encoder)
@@ -208,7 +326,8 @@ def load(folder: RunFolder, weights: Path | None = None) -> Policy:
         encoder = eqx.combine(arrays.pop(FROZEN), encoder)
     loaded = {name: eqx.combine(arrays[name], getattr(state, name)) for name in arrays}
     state = dataclasses.replace(state, **loaded)
-    return Policy(agent, state, config, spec, description.get("step"), encoder)
+    step = (description if path == newest else said_of(path)).get("step")
+    return Policy(agent, state, config, spec, step, encoder)
 
 
 def _described(folder: RunFolder) -> tuple[JsonObject, RunConfig, EnvSpec]:

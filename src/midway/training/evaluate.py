@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from midway.statistics import Estimate, of_policy
 from midway.training import faults
 from midway.types import AnyArray, Info, NumPyArray, Observations, VectorGoalEnv
 
@@ -47,6 +48,11 @@ class Evaluation:
     def success_rate(self) -> float:
         """Share of the episodes that reached their goal."""
         return float(np.mean([episode.success for episode in self.episodes]))
+
+    @property
+    def success(self) -> Estimate:
+        """The same with Wilson's 95 % interval."""
+        return of_policy(self.success_rate, len(self.episodes))
 
     @property
     def final_distance(self) -> float:

@@ -29,7 +29,8 @@ class Logger:
         metrics: ``metrics.csv``.
         evaluation: ``evaluation.csv``.
         events: Folder of TensorBoard event files.
-        until: Step that the run continues from; later rows of the files are dropped.
+        until: Step that the run continues from; later rows of the files are dropped, and those of
+            step 0 where it begins.
         say: Is told when events cannot be written.
 
     Raises:
@@ -45,8 +46,9 @@ class Logger:
         until: int,
         say: Callable[[str], None],
     ) -> None:
-        self._metrics = Appender(metrics, until)
-        self._evaluation = Appender(evaluation, until)
+        self._metrics, self._evaluation = (
+            Appender(path, until or -1) for path in (metrics, evaluation)
+        )
         self._events = Events(events, until, say)
 
     def metrics(self, step: int, values: Mapping[str, int | float]) -> None:

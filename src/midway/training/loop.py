@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from midway.errors import BrokenEnvironmentError, NonFiniteError
-from midway.training import acting
+from midway.training import acting, seeds
 from midway.training.arrays import named_arrays
 from midway.training.compilation import give_back_memory
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
@@ -47,6 +47,12 @@ class Sinks(Protocol):
 
     def snapshot(self, training: Training) -> None:
         """Keep the weights of this step."""
+
+    def is_better(self, result: Evaluation) -> bool:
+        """Return whether the result is surely better than that of the best policy so far."""
+
+    def best(self, training: Training, confirmed: Evaluation) -> None:
+        """Keep the policy as the best, with the result that confirmed it."""
 
     def checkpoint(self, training: Training) -> None:
         """Write all that the future depends on, and the policy."""
@@ -118,27 +124,36 @@ def metrics(training: Training) -> dict[str, float]:
 
 
 def evaluate(training: Training, asked: Asked) -> Iterator[Evaluation]:
-    """Yield the evaluations of the current policy, on environments of their own.
+    """Yield the evaluations of the current policy, on environments and episodes of their own.
+
+    Before the first step, the deterministic policy alone is evaluated.
 
     Raises:
         Interrupted: The run shall end.
         BrokenEnvironmentError: An environment cannot go on.
     """
-    envs = training.evaluation_envs
+    kinds = EVALUATED_ACTIONS if training.counters.steps else EVALUATED_ACTIONS[:1]
     for task in [task for task in EVALUATED_TASKS if task in training.collector.env.tasks]:
-        if task not in envs:
-            envs[task] = training.make_env(training.setup.train.evaluation_episodes, task)
-        for actions in EVALUATED_ACTIONS:
-            seed = training.streams.evaluation
-            actor = policy(training, actions)
-            yield run_episodes(envs[task], actor, task, actions, seed, asked.check)
+        for actions in kinds:
+            yield _episodes(training, task, actions, asked)
+
+
+def _episodes(
+    training: Training, task: str, actions: ActionKind, asked: Asked, use: int = seeds.EVALUATED
+) -> Evaluation:
+    """Run episodes that belong to this step and use alone."""
+    envs = training.evaluation_envs
+    if task not in envs:
+        envs[task] = training.make_env(training.setup.train.evaluation_episodes, task)
+    seed = training.streams.episodes(training.counters.steps, use)
+    return run_episodes(envs[task], policy(training, actions), task, actions, seed, asked.check)
 
 
 def policy(training: Training, actions: ActionKind) -> acting.Actor:
     """Return the current policy, for observations and goals as the agent sees them."""
     program = training.program
     act = partial(program.act_mean if actions == "mean" else program.act, training.arrays)
-    key = training.streams.evaluation_key
+    key = jax.random.fold_in(training.streams.evaluation_key, training.counters.steps)
     return acting.Actor(training.setup.agent, act, training.begin_episodes, key)
 
 
@@ -180,6 +195,9 @@ def run(training: Training, sinks: Sinks, asked: Asked | None = None) -> bool:
         training.counters = training.counters._replace(seconds=seconds)
 
     _stop_at_fault(training, sinks)
+    if training.counters.steps == 0:
+        take_evaluation(training, sinks, success, asked)
+        tick()
     while training.counters.steps < train.steps and asked.end is None:
         advance(training)
         if training.collector.moved:
@@ -273,14 +291,39 @@ def note_evaluation(
 ) -> dict[str, float]:
     """Evaluate, write a row for each task and kind of action, and return success by task.
 
+    The policy is kept before the rows are written: an evaluation whose rows are there is complete.
+
     Raises:
         Interrupted: The run shall end; nothing is written then.
         BrokenEnvironmentError: An environment cannot go on; nothing is written then.
     """
-    counters, success = training.counters, {}
-    for result in list(evaluate(training, asked or Asked())):
+    counters, success, asked = training.counters, {}, asked or Asked()
+    results = list(evaluate(training, asked))
+    _keep_the_best(training, sinks, results[0], asked)
+    for result in results:
         sinks.evaluation(counters.steps, _clock(counters), result)
         if result.actions == "mean":
             success[f"success/{result.task}"] = result.success_rate
     sinks.progress(counters.steps, success)
     return success
+
+
+def _keep_the_best(training: Training, sinks: Sinks, result: Evaluation, asked: Asked) -> None:
+    """Keep the policy if its evaluation and then episodes of its own say that it is the best.
+
+    Of many evaluations the best one was lucky: what counts are the episodes after it.
+
+    Args:
+        training: The run.
+        sinks: Where the best policy is kept.
+        result: Its evaluation on the shown task, with mean actions.
+        asked: What signals ask for.
+
+    Raises:
+        Interrupted: The run shall end.
+        BrokenEnvironmentError: An environment cannot go on.
+    """
+    if sinks.is_better(result):
+        confirmed = _episodes(training, result.task, result.actions, asked, seeds.CONFIRMED)
+        if sinks.is_better(confirmed):
+            sinks.best(training, confirmed)

@@ -9,13 +9,16 @@ from jaxtyping import Array, Key
 PRETRAINING, EVALUATION, DECODER = 2, 1, 3
 """What tells these streams apart from each other and from those of training."""
 
+EVALUATED, CONFIRMED = 0, 1
+"""What tells the episodes of an evaluation apart from those that confirm the best policy."""
+
 
 class Streams(NamedTuple):
     """Seeds and keys of a training run; further draws fold a counter of steps or updates in.
 
     Attributes:
         env: Seed of the environments that data are collected in.
-        evaluation: Seed of the environments of its evaluations.
+        evaluation: Seed of the environments of its evaluations; see `episodes`.
         action: Seed of the uniform random actions.
         network_key: Of the networks' initial weights.
         update_key: Of the updates.
@@ -30,6 +33,10 @@ class Streams(NamedTuple):
     update_key: Key[Array, ""]
     act_key: Key[Array, ""]
     evaluation_key: Key[Array, ""]
+
+    def episodes(self, step: int, use: int = EVALUATED) -> int:
+        """Return the seed of the episodes of one evaluation: others at each step, for each use."""
+        return int(np.random.SeedSequence((self.evaluation, step, use)).generate_state(1)[0])
 
 
 def training(seed: int) -> Streams:
