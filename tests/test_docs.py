@@ -139,7 +139,11 @@ def test_the_blocks_of_a_page_run_in_their_order(
 def table(page: str, heading: str) -> list[list[str]]:
     """Return the rows of the first table below a heading of a page, without its head."""
     _, _, below = (DOCS / page).read_text().partition(f"\n## {heading}\n")
-    lines = re.findall(r"^\|(.*)\|$", below.partition("\n## ")[0], re.MULTILINE)
+    return _rows(below.partition("\n## ")[0])
+
+
+def _rows(text: str) -> list[list[str]]:
+    lines = re.findall(r"^\|(.*)\|$", text, re.MULTILINE)
     rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)] for line in lines]
     return rows[2:]
 
@@ -194,3 +198,12 @@ def test_the_search_space_is_on_the_page() -> None:
             else:
                 said[name] = Choice(tuple(int(value) for value in low.split(",")))
     assert said == SPACE
+
+
+def test_each_claim_of_the_comparison_names_a_test_that_exists() -> None:
+    rows = [row for row in _rows((DOCS / "comparison.md").read_text()) if row[0] != "made for"]
+    assert len(rows) > 10
+    for row in rows:
+        (name,) = [name for name in names(row[1]) if name.startswith("tests/")]
+        file, _, test = name.partition("::")
+        assert f"\ndef {test}(" in (ROOT / file).read_text(), name
