@@ -14,6 +14,7 @@ from tyro.conf import Positional, arg
 from midway.cli.about import NOTHING, AboutEnv
 from midway.cli.compare import compare
 from midway.cli.parsing import Count, Kept, OptionalCount, parse, plain, run_folders, settings
+from midway.cli.tuning import tune
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
 from midway.training.terminal import print_line
 
@@ -385,6 +386,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "resume": resume,
     "sweep": sweep,
+    "tune": tune,
     "evaluate": evaluate,
     "report": report,
     "compare": compare,
