@@ -13,16 +13,19 @@ QUICK := tests/test_architecture.py tests/test_dependencies.py tests/test_functi
 PYTEST := $(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 COVERAGE := --cov=midway
 
-.PHONY: train check test test-all test-lowest lint format clean
+INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-$(VENV)/installed: pyproject.toml
+.PHONY: train check test test-all test-lowest tested site docs lint format clean
+
+# The tested set: newer releases of what midway needs come in through constraints.txt alone.
+$(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(INSTALL) '.[dev]'
 	touch $@
 
 $(VENV)/installed-extras: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --editable '.[dev,cluster,data,robotics]'
+	$(INSTALL) '.[dev,cluster,data,docs,robotics]'
 	touch $@
 
 # Typed again, it continues where it was stopped.
@@ -38,11 +41,19 @@ check: lint
 
 # Everything that needs no extra.
 test: lint
-	$(PYTEST) $(COVERAGE) -m "not extra"
+	$(PYTEST) $(COVERAGE) -m "not extra and not docs and not release"
 
 # Everything. Chromium and Xvfb are Debian's: .ci/run installs them.
 test-all: $(VENV)/installed-extras lint
-	$(PYTEST) $(COVERAGE)
+	$(PYTEST) $(COVERAGE) -m "not docs and not release"
+
+# The site, in build/site: fails at a broken link between pages or to a docstring.
+site: $(VENV)/installed-extras
+	$(BIN)/sphinx-build --builder html --fail-on-warning --keep-going --quiet docs build/site
+
+# The site, and every block of its pages as it is written: commands and Python, with tiny runs.
+docs: site
+	$(BIN)/pytest tests/test_docs.py
 
 # The quick tests with the oldest releases that pyproject.toml allows, in a venv of their own.
 test-lowest:
@@ -52,6 +63,10 @@ test-lowest:
 	$(VENV)-lowest/bin/python -m pip install --quiet --editable '.[dev,cluster]' \
 		--constraint $(VENV)-lowest/constraints.txt
 	$(VENV)-lowest/bin/pytest --numprocesses auto --dist loadfile $(QUICK) tests/envs/test_mazes.py tests/envs/test_point_maze.py
+
+# After `pip install --upgrade` and `make test-all`: what constraints.txt is to hold.
+tested: $(VENV)/installed-extras
+	@$(BIN)/python .ci/tested.py
 
 lint: $(VENV)/installed
 	$(BIN)/ruff format --check .

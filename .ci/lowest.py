@@ -10,4 +10,5 @@ from pathlib import Path
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
 
 for requirement in chain(PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()):
-    print(requirement.replace(">=", "=="))
+    if not requirement.startswith("midway["):
+        print(requirement.replace(">=", "=="))

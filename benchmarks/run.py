@@ -25,6 +25,13 @@ POINT_MAZES = ("point-u", "point-s", "point-pi", "point-omega")
 SEEDS = range(5)
 F32 = ("--precision", "f32")
 BF16 = ("--precision", "bf16")
+ROBOTICS = {
+    "PandaReach-v3": 20_000,
+    "PointMaze_UMaze-v3": 24_000,
+    "PointMaze_Medium-v3": 48_000,
+    "FetchReach-v4": 20_000,
+}
+"""Environment steps on the environments of others; 50 episodes an evaluation take their time."""
 SUITES: dict[str, list[Job]] = {
     "point-mazes": [
         Job(env, agent, seed, BF16)
@@ -43,6 +50,12 @@ SUITES: dict[str, list[Job]] = {
         Job("ant-u", "sac", 0),
     ],
     "ant-u": [Job("ant-u", agent, 0, BF16) for agent in ("ris", "sac", "leap")],
+    "robotics": [
+        Job(env, agent, seed, ("--set", f"steps={steps}", "evaluation_episodes=50"))
+        for env, steps in ROBOTICS.items()
+        for agent in ("ris", "sac")
+        for seed in range(3)
+    ],
 }
 
 

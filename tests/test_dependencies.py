@@ -2,6 +2,7 @@
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator
@@ -16,7 +17,10 @@ ROOT = Path(__file__).parents[1]
 SOURCE, TESTS = ROOT / "src" / "midway", ROOT / "tests"
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
-TOOLS = {"beartype", "mypy", "pre-commit", "pytest-cov", "pytest-timeout", "pytest-xdist", "ruff"}
+TOOLS = {
+    *("beartype", "build", "mypy", "pre-commit", "ruff"),
+    *("pytest-cov", "pytest-timeout", "pytest-xdist"),
+}
 """Of the extra ``dev``: what is run, or plugged into pytest, and imported by no test."""
 
 PROVIDERS = packages_distributions()
@@ -27,9 +31,14 @@ def canonical(name: str) -> str:
 
 
 def requirements(lines: Iterable[str]) -> dict[str, str]:
-    """Return the lower bound of each distribution; every line is written ``name>=1.2.3``."""
+    """Return the lower bound of each distribution; every line is written ``name>=1.2.3``.
+
+    A line ``midway[extra]`` stands for another extra, which is read at its own place.
+    """
     found = {}
     for line in lines:
+        if line.startswith("midway["):
+            continue
         match = re.fullmatch(r"([\w-]+)>=(\d+(?:\.\d+)*)", line)
         assert match, f"not written as name>=version: {line}"
         found[canonical(match[1])] = match[2]
@@ -41,8 +50,10 @@ EXTRAS = {
     name: requirements(lines)
     for name, lines in PYPROJECT["project"]["optional-dependencies"].items()
 }
+BOUNDS = DECLARED | {name: bound for extra in EXTRAS.values() for name, bound in extra.items()}
 DEV, ROBOTICS = EXTRAS.pop("dev"), EXTRAS.pop("robotics")
 ROBOTICS |= EXTRAS.pop("ogbench")
+del EXTRAS["docs"]  # run by `make docs`, imported by nothing
 assert EXTRAS["data"].pop("h5py")  # Minari reads its files by it
 OPTIONAL = {name for extra in EXTRAS.values() for name in extra}
 
@@ -66,9 +77,9 @@ def distribution_of(name: str, declared: Iterable[str]) -> str:
     return min(providers & set(declared) or providers)
 
 
-def found_in(folder: Path, declared: Iterable[str]) -> set[tuple[str, bool]]:
+def found_in(folder: Path, declared: Iterable[str], but: str = "") -> set[tuple[str, bool]]:
     """Return the distributions that the files import, but for Python's own and their own."""
-    files = [*folder.rglob("*.py")]
+    files = [path for path in folder.rglob("*.py") if but not in path.parts]
     own = {"midway", *sys.stdlib_module_names, *(path.stem for path in files)}
     names = {found for path in files for found in imported(ast.parse(path.read_text()))}
     return {(distribution_of(name, declared), inside) for name, inside in names if name not in own}
@@ -79,7 +90,38 @@ def test_the_package_imports_what_it_declares() -> None:
 
 
 def test_what_an_extra_installs_is_imported_where_it_is_needed() -> None:
-    assert {name for name, inside in found_in(SOURCE, OPTIONAL) if not inside} & OPTIONAL == set()
+    found = {name for name, inside in found_in(SOURCE, OPTIONAL) if not inside}
+    assert found & OPTIONAL == set(EXTRAS["plots"])
+    elsewhere = found_in(SOURCE, OPTIONAL, but="reports")
+    assert {name for name, inside in elsewhere if not inside} & OPTIONAL == set()
+
+
+WITHOUT_PLOTS = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name in {names}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Missing())
+from midway import api, presets
+from midway.bench import pieces
+from midway.cluster import sweep
+from midway.cli.main import main
+main(["presets", "point-u"])
+main(["report", "nowhere"])
+"""
+
+
+def test_the_core_does_without_the_extras_and_names_them() -> None:
+    names = {"PIL", "imageio_ffmpeg", "jinja2", "matplotlib", "minari", "ray"}
+    script = WITHOUT_PLOTS.format(names=names)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 2, done.stderr
+    assert done.stdout.startswith("steps")
+    (line,) = done.stderr.splitlines()
+    assert re.fullmatch(r"midway: a figure needs \w+: pip install 'midway\[plots\]'", line), line
 
 
 def test_the_extras_of_environments_hold_the_packages_that_are_found_by_their_ids() -> None:
@@ -92,12 +134,22 @@ def test_the_tests_import_what_is_declared() -> None:
     assert set(DEV) >= TOOLS
 
 
+def numbers(text: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", text)[:3])
+
+
 @pytest.mark.parametrize("name", sorted({**DECLARED, **DEV}))
 def test_what_is_tested_is_within_the_bounds(name: str) -> None:
-    def numbers(text: str) -> tuple[int, ...]:
-        return tuple(int(part) for part in re.findall(r"\d+", text)[:3])
-
     assert numbers(version(name)) >= numbers({**DECLARED, **DEV}[name])
+
+
+def test_the_constraints_hold_a_tested_release_of_everything() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    tested = dict(line.split("==") for line in lines)
+    del BOUNDS["ogbench"]  # not installed where the tests run
+    assert {name for name in BOUNDS if name not in tested} == set()
+    for name, bound in BOUNDS.items():
+        assert numbers(tested[name]) >= numbers(bound), name
 
 
 def test_the_package_holds_the_files_that_it_declares() -> None:

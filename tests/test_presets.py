@@ -1,27 +1,17 @@
-"""The table of presets: every row means something, and gives what the presets before it gave."""
+"""The table of presets: every row means something, and later rows win."""
 
-import dataclasses
 import json
 from pathlib import Path
 
 import pytest
 
 from midway import presets, settings
-from midway.agents import beyond
 from midway.agents.registry import AGENTS
 from midway.cli.main import main
 from midway.envs.registry import ENVIRONMENTS, Declaration
 from midway.errors import ConfigurationError
 from midway.presets import RULES, Rule, Source
 from midway.training.config import TrainConfig
-
-GOLDEN = json.loads((Path(__file__).parent / "golden" / "presets.json").read_text())
-RENAMED = {"encoder_updates": "freeze_encoder_after", "image_translation": "random_shift"}
-"""Settings that commit 47b95e9 called otherwise."""
-
-BEFORE = {key: tuple(key.split()) for key in GOLDEN["differences"]}
-"""The combinations that commit 47b95e9 knew."""
-
 
 OTHER = Declaration("Reach-v0", "Reach-v0", "other", "not midway's", ("uniform",), "")
 
@@ -34,12 +24,6 @@ def applicable(rule: Rule) -> list[tuple[str, str, str]]:
         for agent in AGENTS
         if rule.applies(preset, declaration, agent)
     ]
-
-
-def plain(config: object) -> dict[str, object]:
-    """Return the settings as JSON has them."""
-    found: dict[str, object] = json.loads(json.dumps(dataclasses.asdict(config)))  # type: ignore[call-overload]
-    return found
 
 
 def identity(rule: Rule) -> str:
@@ -71,45 +55,12 @@ def test_every_value_of_paper_has_a_source(env: str, agent: str) -> None:
             assert resolved.sources[name].source, name
 
 
-@pytest.mark.parametrize("key", BEFORE)
-def test_values_are_those_of_the_presets_before(key: str) -> None:
-    preset, env, agent = BEFORE[key]
-    before = GOLDEN["paper ant-u"][agent] | GOLDEN["differences"][key]
-    expected = {RENAMED.get(name, name): value for name, value in before.items()}
-    # Frozen encoders were a matter of agents that had one, and no setting of states meant anything.
-    expected.setdefault("freeze_encoder_after", 0)
-    expected = NEW | expected
-    expected["relabel"] = {**expected["relabel"], "future_discount": 1.0}
-    resolved = presets.resolve(env, agent, preset)
-    found = plain(resolved.train) | plain(resolved.hyperparameters)
-    if preset == "quick":  # this machine's fastest
-        expected["precision"] = found["precision"]
-    differ = {n: (expected.get(n), found[n]) for n in found}
-    differ = {n: pair for n, pair in differ.items() if pair[0] != pair[1]}
-    if preset == "quick" and ENVIRONMENTS[env].family == "ant" and agent in FASTER:
-        assert differ.keys() <= FASTER[agent]
-    else:
-        assert differ == INTENDED.get(key, {})
-
-
-NEW = {"collect": True, "collect_limit": 0, "normalise": False, **vars(beyond.SubgoalSettings())}
-"""Settings that there were none of, with the values that stand for that."""
-
-FASTER = {
-    agent: {
-        name
-        for rule in presets.QUICK
-        if "trials of ant-u" in rule.source and agent in rule.agent.split()
-        for name in rule.values
-    }
-    for agent in ("ris", "sac")
-}
-"""What `quick` changed of the ant since, for faster learning."""
-
-NO_IMAGES: dict[str, tuple[object, object]] = {"freeze_encoder_after": (15_000, 0)}
-
-INTENDED = {"quick push-state ris": NO_IMAGES, "quick push-state sac": NO_IMAGES}
-"""What is meant to differ, (before, now): where there are no images, no encoder is frozen."""
+def test_relabelling_of_tdm_and_leap_is_the_appendixs_in_paper() -> None:
+    for agent in ("tdm", "leap"):
+        published = presets.resolve("ant-u", agent, "paper").train.relabel
+        assert (published.own, published.random, published.future) == (0.2, 0.4, 0.4)
+        ours = presets.resolve("ant-u", agent).train.relabel
+        assert (ours.own, ours.random, ours.future) == (0.4, 0.2, 0.4)
 
 
 def test_later_rules_win(monkeypatch: pytest.MonkeyPatch) -> None:

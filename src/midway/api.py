@@ -228,7 +228,7 @@ def load(path: str | Path, policy: Which = "last") -> Policy:
     Raises:
         ConfigurationError: The folder holds no such policy, or a damaged or foreign one.
     """
-    folder = RunFolder(Path(path))
+    folder = RunFolder.at(path)
     return policies.load(folder, policies.weights_of(folder, policy))
 
 

@@ -1,5 +1,8 @@
 """What the package raises on purpose; the file loads nothing, so that declarations import fast."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class ConfigurationError(ValueError):
     """A name, value or folder that the user gave cannot be used; its text is one clear line."""
@@ -15,3 +18,24 @@ class BrokenEnvironmentError(RuntimeError):
 
 class NonFiniteObservationError(BrokenEnvironmentError, NonFiniteError):
     """An environment shows a number that is not finite."""
+
+
+@contextmanager
+def needing(extra: str, what: str) -> Iterator[None]:
+    """Name the extra that installs a library which the imports inside do not find.
+
+    Args:
+        extra: Extra of the package.
+        what: What the user asked for.
+
+    Raises:
+        ConfigurationError: A library is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "midway").startswith("midway"):
+            raise
+        raise ConfigurationError(
+            f"{what} needs {error.name}: pip install 'midway[{extra}]'"
+        ) from error

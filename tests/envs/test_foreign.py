@@ -389,8 +389,15 @@ def test_train_resume_and_evaluate(tmp_path: Path, agent: str) -> None:
     result = midway.evaluate(made.path, episodes=3)
     assert result.task == "uniform"
     assert len(result.episodes) == 3
-    action = midway.load(made.path)(np.zeros(4, np.float32), np.zeros(2, np.float32))
+    policy = midway.load(made.path)
+    action = policy(np.zeros(4, np.float32), np.zeros(2, np.float32))
     assert action.shape == (2,)
+    env = gymnasium.make(name)
+    shown, _ = env.reset(seed=0)
+    own = policy.predict(shown)
+    assert env.action_space.contains(own)
+    pair = [shown[key].astype(np.float32) for key in ("observation", "desired_goal")]
+    np.testing.assert_allclose(own, policy(*pair), rtol=1e-5)
 
 
 def test_success_is_what_the_environment_says_in_a_loop_of_its_own(tmp_path: Path) -> None:

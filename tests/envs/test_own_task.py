@@ -18,7 +18,7 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "your-own-task.md"
 @pytest.fixture
 def boat(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """Put the document's environment into the working folder; return its name."""
-    found = re.search(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    found = re.search(r"```python boat\.py\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     assert found is not None
     (tmp_path / "boat.py").write_text(found[1])
     monkeypatch.chdir(tmp_path)

@@ -43,6 +43,13 @@ def test_a_policy_loads_without_an_environment(
     zeros = np.zeros((3, 4), np.float32)
     assert policy(zeros, zeros).shape == (3, 2)
     assert policy.value(zeros, zeros).shape == (3,)
+    shown = {name: zeros for name in ("observation", "achieved_goal", "desired_goal")}
+    np.testing.assert_array_equal(policy.predict(shown), policy(zeros, zeros))
+    one = {name: batch[0] for name, batch in shown.items()}
+    np.testing.assert_allclose(policy.predict(one), policy(zeros, zeros)[0], rtol=1e-6)
+    drawn = policy.predict(shown, deterministic=False, seed=1)
+    np.testing.assert_array_equal(drawn, policy.predict(shown, deterministic=False, seed=1))
+    assert (drawn != policy.predict(shown, deterministic=False)).all()
 
 
 SPECS = [

@@ -7,7 +7,7 @@ SMALL = {
     "random_steps": 20,
     "updates_per_step": 0.5,
     "replay_capacity": 500,
-    "evaluate_every": 40,
+    "evaluate_every": 60,
     "evaluation_episodes": 1,
     "log_every": 10,
     "checkpoint_every": 30,

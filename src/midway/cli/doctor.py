@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from midway.errors import needing
+
 LIBRARIES = ("jax", "equinox", "optax", "mujoco", "gymnasium", "orbax-checkpoint")
 
 
@@ -36,6 +38,7 @@ def checks() -> list[Check]:
         _check("device", _device),
         _check("simulation", _simulation),
         _check("rendering", _rendering, needed=False),
+        _check("figures", _figures, needed=False),
         _check("video", _video, needed=False),
     ]
 
@@ -74,7 +77,15 @@ def _rendering() -> str:
     return str(rendering.backend())
 
 
+def _figures() -> str:
+    with needing("plots", "a figure"):
+        import matplotlib
+
+    return f"matplotlib {matplotlib.__version__}"
+
+
 def _video() -> str:
-    import imageio_ffmpeg
+    with needing("video", "a video"):
+        import imageio_ffmpeg
 
     return str(imageio_ffmpeg.get_ffmpeg_version())

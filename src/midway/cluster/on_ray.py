@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from midway.cluster.jobs import Job, State, execute, finished
-from midway.errors import ConfigurationError
+from midway.errors import ConfigurationError, needing
 
 RETRIES = 20
 REACH_SECONDS = 10.0
@@ -25,12 +25,8 @@ def start(
     Raises:
         ConfigurationError: Ray is not installed, or the cluster is not reached.
     """
-    try:
+    with needing("cluster", "--ray"):
         import ray
-    except ImportError as error:
-        raise ConfigurationError(
-            "--ray needs the extra `cluster`: pip install 'midway[cluster]'"
-        ) from error
     _check_reached(address)
     try:
         ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)

@@ -10,7 +10,7 @@ from midway.envs.foreign import Foreign
 from midway.envs.group import action_bounds
 from midway.envs.reading import GOAL_KEYS, STATE_KEYS, readings
 from midway.envs.success import judge
-from midway.errors import ConfigurationError
+from midway.errors import ConfigurationError, needing
 from midway.types import NumPyArray, Trajectory
 
 
@@ -80,11 +80,9 @@ def _as_agents_see(
 
 
 def _open(dataset: str) -> Any:
-    try:
+    with needing("data", f"--data {dataset}"):
         import minari
         from minari.dataset.minari_dataset import MinariDataset
-    except ImportError as error:
-        raise ConfigurationError(f"--data {dataset}: pip install 'midway[data]'") from error
     try:
         folder = Path(dataset)
         return MinariDataset(folder / "data") if folder.is_dir() else minari.load_dataset(dataset)

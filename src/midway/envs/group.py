@@ -85,12 +85,12 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
 
     def step(self, actions: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """Move every environment by one step, by actions in [-1, 1]; NaN: it rests."""
-        scaled = self.low + (np.clip(actions, -1, 1) + 1) / 2 * (self.high - self.low)
+        wanted = scaled(actions, self.low, self.high)
         for place, env in enumerate(self.envs):
-            if np.isnan(scaled[place]).any():
+            if np.isnan(wanted[place]).any():
                 self._flag(place, False, False, -1)
                 continue
-            action = scaled[place].reshape(env.action_space.shape).astype(env.action_space.dtype)
+            action = wanted[place].reshape(env.action_space.shape).astype(env.action_space.dtype)
             self.lengths[place] += 1
             with self._naming(place, action):
                 observation, _, terminated, truncated, info = env.step(action)
@@ -149,3 +149,8 @@ def action_bounds(space: spaces.Box, bound: float | None) -> tuple[Array, Array]
     if bound is None:
         return low, high
     return np.where(np.isfinite(low), low, -bound), np.where(np.isfinite(high), high, bound)
+
+
+def scaled(actions: Array, low: Array, high: Array) -> Array:
+    """Return actions in [-1, 1] ``(..., A)`` between these bounds; beyond is the nearest bound."""
+    return low + (np.clip(actions, -1, 1) + 1) / 2 * (high - low)

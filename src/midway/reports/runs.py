@@ -193,7 +193,7 @@ def read(path: Path, policy: Which = "last") -> RunData:
         ConfigurationError: It is no run folder, or its configuration is damaged or of another
             version.
     """
-    folder = RunFolder(path)
+    folder = RunFolder.at(path)
     config = folder.load_config()
     record = read_json(folder.config_file)
     metrics, wrong = _table(folder.metrics_file, METRICS)

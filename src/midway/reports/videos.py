@@ -9,11 +9,10 @@ from itertools import chain
 from pathlib import Path
 from subprocess import PIPE
 
-import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
-from midway.errors import ConfigurationError
+from midway.errors import ConfigurationError, needing
 from midway.reports import scenes
 from midway.reports.recordings import Recording, record
 from midway.reports.runs import RunData, agent_labels, read
@@ -154,6 +153,8 @@ def write(path: Path, frames: Iterator[Frame], rate: int) -> None:
 
 def _write_mp4(path: Path, frames: Iterator[Frame], rate: int) -> None:
     """Pipe the frames to ffmpeg; imageio's own writer would fork, which JAX's threads forbid."""
+    with needing("video", f"the video {path.name}"):
+        import imageio_ffmpeg
     first = next(frames)
     size = f"{first.shape[1]}x{first.shape[0]}"
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y"]

@@ -137,11 +137,31 @@ def run_name(env: str, agent: str, seed: int) -> str:
     return "-".join([*parts, f"seed{seed}"])
 
 
+ZOO = Path(__file__).parents[3] / "zoo"
+"""Trained policies of the repository; a wheel holds none."""
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """Names of the files of a run."""
 
     path: Path
+
+    @classmethod
+    def at(cls, path: str | Path) -> "RunFolder":
+        """Return the folder of a path, or of a policy that comes with midway: ``zoo:ant-u-ris``.
+
+        Raises:
+            ConfigurationError: There is no such policy.
+        """
+        name = str(path).removeprefix("zoo:")
+        if name == str(path):
+            return cls(Path(path))
+        known = sorted(folder.parent.name for folder in ZOO.glob("*/policy.json"))
+        if name not in known:
+            there = ", ".join(known) or "nothing: it comes with a checkout"
+            raise ConfigurationError(f"{path}: the zoo has {there}")
+        return cls(ZOO / name)
 
     @property
     def config_file(self) -> Path:
@@ -290,8 +310,15 @@ def provenance() -> JsonObject:
         },
         "commit": _commit(),
         "machine": {"processor": platform.machine(), "cores": len(os.sched_getaffinity(0))},
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": _command(),
     }
+
+
+def _command() -> str:
+    """Return the command that this process is, as it is typed; ``python -m midway.cli`` too."""
+    program = Path(sys.argv[0])
+    name = "midway" if program.name == "__main__.py" else program.name
+    return shlex.join([name, *sys.argv[1:]])
 
 
 def _commit() -> str | None:

@@ -1,7 +1,7 @@
 """Saved policies: weights and a description that others can load."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from midway.agent import AgentState, AnyAgent, Encoder, Inputs, Memory, SubgoalDistribution
 from midway.agents import registry
+from midway.envs import own_spaces
 from midway.errors import ConfigurationError
 from midway.runs.folder import (
     FORMAT,
@@ -93,6 +94,38 @@ class Policy:
     def sample(self, observation: Seen, goal: Seen, key: Key[Array, ""]) -> NumPyArray:
         """Return sampled actions ``(B, action_dim)`` for batches."""
         return self._act(observation, goal, key, explore=True)
+
+    def predict(
+        self,
+        observation: Mapping[str, object],
+        deterministic: bool = True,
+        seed: int | None = None,
+    ) -> NumPyArray:
+        """Return the action for what the environment itself observes, as it takes actions.
+
+        An agent that remembers its episode (TDM, LEAP) acts as in the first step of one; `actor`
+        remembers.
+
+        Args:
+            observation: The environment's dictionary of ``observation``, ``achieved_goal`` and
+                ``desired_goal``, or of batches of B of each.
+            deterministic: Whether the action is the mean one, else a sampled one.
+            seed: Seed of a sampled action; default: another draw on each call.
+
+        Returns:
+            One action, with shape, bounds and type of the environment's action space, or
+            ``(B, ...)`` of them for batches.
+
+        Raises:
+            ConfigurationError: An entry is missing or has another shape, or the environment is not
+                midway's and cannot be made here.
+        """
+        foreign = self.config.declaration().foreign
+        states, goals, single = own_spaces.seen(self.spec, foreign, observation)
+        drawn = np.random.SeedSequence(seed).generate_state(1)[0]
+        actions = self._act(states, goals, jax.random.key(int(drawn)), explore=not deterministic)
+        own = own_spaces.in_own_bounds(foreign, actions)
+        return own[0] if single else own
 
     def actor(self, actions: ActionKind = "mean", seed: int = 0) -> acting.Actor:
         """Return the policy as one that remembers its episodes, from their first step on.

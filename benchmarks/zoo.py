@@ -1,0 +1,102 @@
+"""Put a trained policy into the zoo, with what it reaches in 500 episodes and a video.
+
+    python benchmarks/zoo.py RUN...
+
+Each becomes ``zoo/ENV-AGENT``: a run folder without checkpoints, which ``midway evaluate``,
+``watch``, ``report`` and ``midway.load("zoo:ENV-AGENT")`` read like any other. Its card is
+``README.md``.
+"""
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+
+from midway import api, reports
+from midway.runs.folder import ZOO, RunFolder, read_json
+from midway.statistics import of_policy
+from midway.training.evaluate import ActionKind
+
+KEPT = ("config.json", "metrics.csv", "evaluation.csv", "policy.json", "policy.safetensors")
+EPISODES = 500
+SEED = 1_000
+"""Of starts and goals: training evaluates on others."""
+
+ACTIONS: tuple[ActionKind, ...] = ("mean", "sampled")
+
+
+def main() -> None:
+    """Add the policies of some run folders."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders")
+    for run in parser.parse_args().runs:
+        print(add(RunFolder(run)))
+
+
+def add(run: RunFolder) -> Path:
+    """Copy the policy of a run, measure it, film it and write its card."""
+    config = run.load_config()
+    folder = ZOO / f"{config.env}-{config.agent}"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in KEPT:
+        shutil.copy(run.path / name, folder / name)
+    known = config.declaration().tasks
+    tasks = [task for task in ("hard", "uniform") if task in known]
+    found = [measure(folder, task, actions) for task in tasks for actions in ACTIONS]
+    (folder / "evaluation.json").write_text(json.dumps(found, indent=2) + "\n")
+    reports.watch(folder, folder / f"{tasks[0]}.mp4", task=tasks[0])
+    (folder / "README.md").write_text(card(RunFolder(folder), found))
+    return folder
+
+
+def measure(folder: Path, task: str, actions: ActionKind) -> dict[str, object]:
+    """Return what the policy reaches in a task."""
+    result = api.evaluate(folder, episodes=EPISODES, task=task, actions=actions, seed=SEED)
+    estimate = of_policy(result.success_rate, EPISODES)
+    return {
+        "task": task,
+        "actions": actions,
+        "episodes": EPISODES,
+        "seed": SEED,
+        "success_rate": round(estimate.centre, 4),
+        "interval": [round(estimate.low, 4), round(estimate.high, 4)],
+        "steps": round(result.length, 1),
+        "final_distance": round(result.final_distance, 4),
+    }
+
+
+def card(folder: RunFolder, found: list[dict[str, object]]) -> str:
+    """Return what there is to know of the policy, as Markdown."""
+    config, record = folder.load_config(), read_json(folder.config_file)
+    rows = "\n".join(
+        f"| `{row['task']}` | {row['actions']} | {row['success_rate']:.1%} | "
+        f"{row['interval'][0]:.1%} to {row['interval'][1]:.1%} | {row['steps']} | "
+        f"{row['final_distance']:.2f} m |"
+        for row in found
+    )
+    name, task = folder.path.name, found[0]["task"]
+    who = f"{config.agent.upper()} on `{config.env}`, preset `{config.preset}`, seed {config.seed}"
+    again = f"midway evaluate zoo:{name} --task {task} --episodes {EPISODES} --seed {SEED}"
+    return f"""# {name}
+
+{who}: the policy of step {read_json(folder.policy_config)["step"]:,}.
+
+| task | actions | success | interval (Wilson, 95 %) | steps | distance at the end |
+| --- | --- | --- | --- | --- | --- |
+{rows}
+
+{EPISODES} episodes each (`evaluation.json`; `{again}`).
+One seed of training shows what can happen. Video: `{task}.mp4`.
+
+Trained by `{record["command"]}` at commit `{record["commit"]}`.
+
+```python
+import midway
+
+policy = midway.load("zoo:{name}")
+```
+"""
+
+
+if __name__ == "__main__":
+    main()
