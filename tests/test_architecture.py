@@ -22,7 +22,7 @@ FLOORS = (
     {"networks", "replay", "envs", "planning"},
     {"agents"},
     {"training"},
-    {"runs", "presets"},
+    {"runs", "presets", "spaces"},
     {"configuration"},
     {"api"},
     {"reports", "cluster", "bench"},

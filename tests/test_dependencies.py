@@ -59,14 +59,15 @@ OPTIONAL = {name for extra in EXTRAS.values() for name in extra}
 
 
 def imported(node: ast.AST, inside: bool = False) -> Iterator[tuple[str, bool]]:
-    """Yield the first name of each import, and whether it waits inside a function."""
+    """Yield the first name of each import, and whether it waits in a function or is of types."""
     names = []
     if isinstance(node, ast.Import):
         names = [alias.name for alias in node.names]
     elif isinstance(node, ast.ImportFrom) and not node.level:
         names = [node.module or ""]
     yield from ((name.split(".")[0], inside) for name in names)
-    inside = inside or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    typed = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    inside = inside or typed or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
     for child in ast.iter_child_nodes(node):
         yield from imported(child, inside)
 

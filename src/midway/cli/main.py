@@ -17,6 +17,7 @@ from midway.cli.lists import doctor, envs, presets, runs
 from midway.cli.measure import bench, check
 from midway.cli.parsing import Count, Kept, OptionalCount, parse, print_json, run_folders, settings
 from midway.cli.saved import export, pull, push
+from midway.cli.tuning import tune
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
 from midway.training import signals
 from midway.training.terminal import print_line
@@ -285,6 +286,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "resume": resume,
     "sweep": sweep,
+    "tune": tune,
     "evaluate": evaluate,
     "report": report,
     "compare": compare,

@@ -88,7 +88,7 @@ def run(
     if ray_address is None:
         processes = Processes()
         workers = _local_workers(wanted, folder, states, processes)
-        with _ending(processes):
+        with ending(processes):
             _watch(workers, folder, states, show)
     else:
         _watch(on_ray.start(wanted, folder, states, ray_address), folder, states, show)
@@ -111,7 +111,7 @@ def _watch(
 
 
 @contextmanager
-def _ending(processes: Processes) -> Iterator[None]:
+def ending(processes: Processes) -> Iterator[None]:
     """Let the first signal end all runs with a checkpoint, and the second one at once.
 
     Raises:

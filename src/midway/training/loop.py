@@ -311,7 +311,8 @@ def note_evaluation(
     """
     counters, success, asked = training.counters, {}, asked or Asked()
     results = list(evaluate(training, asked))
-    _keep_the_best(training, sinks, results[0], asked)
+    for shown in results[:1]:
+        _keep_the_best(training, sinks, shown, asked)
     for result in results:
         sinks.evaluation(counters.steps, _clock(counters), result)
         if result.actions == "mean":
