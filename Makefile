@@ -25,7 +25,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/installed-extras: $(VENV)/installed
-	$(INSTALL) '.[dev,cluster,data,docs,robotics,tune]'
+	$(INSTALL) '.[dev,cluster,data,docs,onnx,robotics,tune]'
 	touch $@
 
 # Typed again, it continues where it was stopped.

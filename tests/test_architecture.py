@@ -23,6 +23,7 @@ FLOORS = (
     {"agents"},
     {"training"},
     {"runs", "presets", "spaces"},
+    {"configuration"},
     {"api"},
     {"reports", "cluster", "bench"},
     {"cli"},
@@ -237,7 +238,7 @@ def test_a_symbol_is_found_wherever_it_is_used():
 
 AGENT_NAMES = {*AGENTS, "crl"}
 MAY_NAME_AGENTS = {"agents.registry", "presets"}
-MAY_DEFAULT_TO_AGENTS = {"api", "cli", "bench"}
+MAY_DEFAULT_TO_AGENTS = {"configuration", "api", "cli", "bench"}
 """Rooms whose calls and default arguments may choose an agent; none may compare one."""
 
 GUESS = re.compile(rf"^({'|'.join({e.family for e in ENVIRONMENTS.values()})})(-.*)?$")

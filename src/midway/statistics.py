@@ -157,7 +157,7 @@ def _drawn(
         return np.asarray(scores.values[chosen])
     successes = scores.values * scores.episodes
     failures = scores.episodes - successes
-    return rng.beta(successes[chosen] + PRIOR, failures[chosen] + PRIOR)
+    return np.asarray(rng.beta(successes[chosen] + PRIOR, failures[chosen] + PRIOR))
 
 
 def of_runs(strata: Sequence[Scores]) -> tuple[Float[np.ndarray, " points"], Interval]:
@@ -277,7 +277,7 @@ def _along(
     places: Float[np.ndarray, " own"],
     values: Float[np.ndarray, " own"],
 ) -> Float[np.ndarray, " points"]:
-    return np.interp(x, places, values, left=np.nan, right=np.nan)
+    return np.asarray(np.interp(x, places, values, left=np.nan, right=np.nan))
 
 
 def _episodes(

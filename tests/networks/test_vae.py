@@ -159,13 +159,13 @@ def test_image_values_may_be_bytes_or_shares(image_vae):
 
 
 def test_images_of_a_moving_square_are_reconstructed(image_vae):
-    corners = [(row, column) for row in (0, 25, 50) for column in (0, 25, 50)]
+    corners = [(row, column) for row in (0, 50) for column in (0, 50)]
     images = np.zeros((len(corners), *IMAGE), np.uint8)
     for image, (row, column) in zip(images, corners, strict=True):
         image[row : row + 30, column : column + 30] = 255
     before = reconstruction_error(image_vae, images)
     after = reconstruction_error(
-        trained(image_vae, jnp.asarray(images), 1e-3, 120, batch=8), images
+        trained(image_vae, jnp.asarray(images), 1e-3, 120, batch=4), images
     )
     assert after < 0.3 * before
 

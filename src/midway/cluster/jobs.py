@@ -155,9 +155,9 @@ def finished(job: Job, folder: Path) -> bool:
     run_folder = RunFolder(folder / job.name)
     try:
         steps = job.steps or run_folder.load_config().train.steps
+        return not complete.missing(run_folder, steps)
     except ConfigurationError:  # the run says what is wrong, if there is one
         return False
-    return not complete.missing(run_folder, steps)
 
 
 def check_settings(job: Job, folder: Path, preset: str, changes: Mapping[str, object]) -> None:

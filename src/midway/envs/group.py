@@ -153,4 +153,4 @@ def action_bounds(space: spaces.Box, bound: float | None) -> tuple[Array, Array]
 
 def scaled(actions: Array, low: Array, high: Array) -> Array:
     """Return actions in [-1, 1] ``(..., A)`` between these bounds; beyond is the nearest bound."""
-    return low + (np.clip(actions, -1, 1) + 1) / 2 * (high - low)
+    return np.asarray(low + (np.clip(actions, -1, 1) + 1) / 2 * (high - low))

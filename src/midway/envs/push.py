@@ -120,6 +120,14 @@ class PushStateVectorEnv(SimulationVectorEnv):
             pose[self._arm.addresses] = self._arm.angles(state[:2])
         return poses
 
+    def render(self) -> tuple[Shaped[Array, "84 84 3"], ...]:
+        """Return a picture of each copy, as `push` observes it.
+
+        Raises:
+            ConfigurationError: Nothing here can draw.
+        """
+        return tuple(draw(self.model, self._qpos))
+
     def _states(self) -> Float32[Array, "num_envs 4"]:
         return np.concatenate([self._hands, self._qpos[:, self._puck]], axis=1, dtype=np.float32)
 

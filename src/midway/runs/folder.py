@@ -2,14 +2,8 @@
 
 import dataclasses
 import hashlib
-import importlib.metadata
 import json
-import os
-import platform
 import re
-import shlex
-import subprocess
-import sys
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +16,7 @@ from midway.envs.layouts import Layout
 from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
 from midway.runs import lock
+from midway.runs.provenance import provenance
 from midway.settings import changed
 from midway.training.checkpoint import Owner
 from midway.training.config import TrainConfig
@@ -33,10 +28,8 @@ FORMAT = 3
 SEALED_SINCE = 3
 """The first format whose files all have checksums."""
 
-OUTSIDE = ("steps", "devices")
+OUTSIDE = ("steps", "devices", "stop_at")
 """Settings that may change when a run is continued."""
-
-PACKAGES = ("midway", "jax", "equinox", "optax", "mujoco", "gymnasium", "numpy")
 
 
 @dataclass(frozen=True)
@@ -220,8 +213,12 @@ class RunFolder:
             ConfigurationError: There is a run already, other files lie there, or it cannot be made.
         """
         try:
-            if self.path.exists() and (not self.path.is_dir() or self._strangers()):
-                hint = "use `midway resume`" if self.config_file.exists() else "choose another"
+            if self.path.exists() and (not self.path.is_dir() or self.strangers()):
+                hint = (
+                    "use `midway resume` or --overwrite"
+                    if self.config_file.exists()
+                    else "choose another"
+                )
                 raise ConfigurationError(f"run folder {self.path} is not empty: {hint}")
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -229,8 +226,8 @@ class RunFolder:
                 f"cannot make run folder {self.path}: {error.strerror}"
             ) from error
 
-    def _strangers(self) -> list[Path]:
-        """Return what a process that was killed before its ``config.json`` does not leave."""
+    def strangers(self) -> list[Path]:
+        """Return what is there but what a process leaves that is killed before ``config.json``."""
         left = (self.lock_file.name, self.config_file.name + files.UNFINISHED)
         return [path for path in self.path.iterdir() if path.name not in left]
 
@@ -241,7 +238,7 @@ class RunFolder:
             ConfigurationError: There is a run already, other files lie there, or it cannot be made.
         """
         self.prepare()
-        values = {**config.to_json(), "run": config.identity, **provenance()}
+        values = {**config.to_json(), "run": config.identity, "format": FORMAT, **provenance()}
         try:
             write_json(self.config_file, values)
         except OSError as error:
@@ -252,9 +249,23 @@ class RunFolder:
     def note_resume(self, config: RunConfig) -> None:
         """Add to ``config.json`` how the run was continued, and its new number of steps."""
         values = read_json(self.config_file)
-        again = {**provenance(), "steps": config.train.steps}
+        again = {"format": FORMAT, **provenance(), "steps": config.train.steps}
         continued = {**values, **config.to_json(), "resumed": [*values.get("resumed", []), again]}
         write_json(self.config_file, continued)
+
+    def note_end(self, step: int | None) -> None:
+        """Add to ``config.json`` the step that the run was ended at early; None: it goes on."""
+        values = {name: v for name, v in read_json(self.config_file).items() if name != "ended_at"}
+        write_json(self.config_file, values | ({} if step is None else {"ended_at": step}))
+
+    def ended_at(self) -> int | None:
+        """Return the step that the run was ended at before its settings do, if it was.
+
+        Raises:
+            ConfigurationError: This is no run folder.
+        """
+        step = read_json(self.config_file).get("ended_at")
+        return step if isinstance(step, int) else None
 
     def remove_unfinished(self) -> None:
         """Remove files that a process which was killed did not finish writing."""
@@ -298,41 +309,6 @@ class RunFolder:
             return RunConfig.from_json(values)
         except ConfigurationError as error:
             raise ConfigurationError(f"{self.config_file}: {error}") from error
-
-
-def provenance() -> JsonObject:
-    """Return format, versions, commit, machine and command."""
-    return {
-        "format": FORMAT,
-        "versions": {
-            "python": platform.python_version(),
-            **{name: importlib.metadata.version(name) for name in PACKAGES},
-        },
-        "commit": _commit(),
-        "machine": {"processor": platform.machine(), "cores": len(os.sched_getaffinity(0))},
-        "command": _command(),
-    }
-
-
-def _command() -> str:
-    """Return the command that this process is, as it is typed; ``python -m midway.cli`` too."""
-    program = Path(sys.argv[0])
-    name = "midway" if program.name == "__main__.py" else program.name
-    return shlex.join([name, *sys.argv[1:]])
-
-
-def _commit() -> str | None:
-    """Return the commit of the source tree that the package runs from, if it is one."""
-    try:
-        answer = subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"],
-            capture_output=True,
-            text=True,
-            timeout=10,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return answer.stdout.strip() if answer.returncode == 0 else None
 
 
 def write_json(path: Path, values: JsonObject) -> None:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
+from midway import functional
 from midway.agent import AgentState, AnyAgent, Encoder, Inputs, Memory, SubgoalDistribution
 from midway.agents import registry
 from midway.envs import own_spaces
@@ -124,7 +125,7 @@ class Policy:
         states, goals, single = own_spaces.seen(self.spec, foreign, observation)
         drawn = np.random.SeedSequence(seed).generate_state(1)[0]
         actions = self._act(states, goals, jax.random.key(int(drawn)), explore=not deterministic)
-        own = own_spaces.in_own_bounds(foreign, actions)
+        own = own_spaces.in_own_bounds(self.spec, foreign, actions)
         return own[0] if single else own
 
     def actor(self, actions: ActionKind = "mean", seed: int = 0) -> acting.Actor:
@@ -204,6 +205,14 @@ def _act_on(
 ) -> tuple[Float[Array, "B A"], Memory]:
     pair = (_read(encoder, observation), _read(encoder, goal))
     return acting.act(agent, state, memory, *pair, key, explore=explore)
+
+
+def current(config: RunConfig, training: Training) -> Policy:
+    """Return a copy of the policy of a run in memory, which outlives the next update."""
+    state = functional.copy(training.state)
+    step = training.counters.steps
+    agent, spec = training.setup.agent, training.env_spec
+    return Policy(agent, state, config, spec, step, training.encoder)
 
 
 def save(folder: RunFolder, config: RunConfig, training: Training) -> None:

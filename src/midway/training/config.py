@@ -50,6 +50,9 @@ class TrainConfig:
     )
     collect: bool = setting(True, "ours", "whether steps are taken, or counted only")
     devices: int = setting(1, "ours", "accelerators that batch and replay are split over", least=1)
+    stop_at: float = setting(
+        0.0, "not in the paper", "success that ends the run; 0: none", least=0, most=1
+    )
     task: str = setting("uniform", "appendix C", "starts and goals that are trained on")
 
     def __post_init__(self) -> None:

@@ -84,6 +84,8 @@ class Training:
         streams: Seeds and keys of all draws.
         encoder: The frozen encoder of images; None while there is none.
         counters: How far it is.
+        evaluation_envs: Environments of evaluations by task.
+        ends_at: Step that those who watch the run have ended it at, before its settings do.
     """
 
     setup: Setup
@@ -97,6 +99,12 @@ class Training:
     encoder: Encoder | None = None
     counters: Counters = field(default_factory=Counters)
     evaluation_envs: dict[str, VectorGoalEnv] = field(default_factory=dict)
+    ends_at: int | None = None
+
+    @property
+    def last_step(self) -> int:
+        """The step that the run is finished at."""
+        return self.setup.train.steps if self.ends_at is None else self.ends_at
 
     @property
     def state(self) -> AgentState:
