@@ -110,8 +110,6 @@ def configure(
     Raises:
         ConfigurationError: A name is unknown or a value is not allowed.
     """
-    if type(seed) is not int or not 0 <= seed < 2**63:
-        raise ConfigurationError(f"seed {seed!r}: must be a whole number from 0 to 2**63 - 1")
     name = agents.name_of(agent)
     declared = environments.entry(env)
     resolved = presets.resolve(declared, name, preset, changes)

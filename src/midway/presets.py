@@ -417,7 +417,7 @@ def _read(path: Path) -> tuple[str, Sequence[Rule]]:
         base = content.pop("base", "quick")
         given = content.pop("rule", [])
         rules = [Rule("*", **{"source": path.name, **rule}) for rule in given]
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # no TOML, absurd numbers or depth
         raise ConfigurationError(f"preset {path}: {error}") from error
     except (TypeError, AttributeError):
         raise ConfigurationError(

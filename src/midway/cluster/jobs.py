@@ -180,5 +180,5 @@ def last_success(evaluation: Path) -> tuple[int | None, float | None]:
         hard = last & (table["task"] == "hard")
         row = np.flatnonzero(hard if hard.any() else last)[0]
         return int(table["step"][row]), float(table["success_rate"][row])
-    except (ConfigurationError, KeyError, IndexError, ValueError):
+    except (ConfigurationError, KeyError, IndexError, ValueError, OverflowError):
         return None, None

@@ -26,6 +26,7 @@ from midway.envs.success import Rule, judge, reference_of
 from midway.envs.vector import Array, GoalVectorEnv
 from midway.envs.workers import Workers
 from midway.errors import ConfigurationError, NonFiniteObservationError
+from midway.plain import check_kinds
 from midway.types import DistanceTask, EnvSpec, Observations, Step, UnknownTask
 
 CHEAP_SECONDS = 0.002
@@ -120,7 +121,7 @@ class Foreign:
             ConfigurationError: It is none.
         """
         try:
-            return Foreign(
+            foreign = Foreign(
                 source=Source.from_json(stored["source"]),
                 spec=replace(
                     EnvSpec.from_json(stored["spec"]), task=success.from_json(stored["success"])
@@ -128,8 +129,11 @@ class Foreign:
                 settings=Settings(**stored["settings"]),
                 seconds=float(stored["seconds"]),
             )
-        except (KeyError, TypeError, AttributeError) as error:
+            for part in (foreign, foreign.source, foreign.spec.task, foreign.settings):
+                check_kinds(part)
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
             raise ConfigurationError(f"stored environment cannot be read: {error}") from error
+        return foreign
 
 
 def describe(
