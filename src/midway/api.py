@@ -49,6 +49,7 @@ def goal_env(
     success_function: str | Callable[..., object] | None = None,
     max_episode_steps: int | None = None,
     action_bound: float | None = None,
+    step_seconds: float = Settings.step_seconds,
     kwargs: Mapping[str, object] | None = None,
     imports: Sequence[str] = (),
 ) -> Foreign:
@@ -62,6 +63,8 @@ def goal_env(
             ``module:function``.
         max_episode_steps: Steps of an episode, in place of the registered limit.
         action_bound: Bounds of actions that have none.
+        step_seconds: Seconds that a step or a reset of all copies may take where other processes
+            step them: one that takes longer is taken for hanging.
         kwargs: Keyword arguments of the environment.
         imports: Modules to import first, which register environments.
 
@@ -69,7 +72,9 @@ def goal_env(
         ConfigurationError: It cannot be made, is no goal environment, has no limit, or does not
             say when a goal is reached; the text says what to give.
     """
-    said = Settings(success_distance, success_function, max_episode_steps, action_bound)
+    said = Settings(
+        success_distance, success_function, max_episode_steps, action_bound, step_seconds
+    )
     return foreign.admit(foreign.describe(env, said, kwargs, tuple(imports)))
 
 
@@ -134,6 +139,7 @@ def train(
     num_envs: int | None = None,
     out: str | Path | None = None,
     precision: str | None = None,
+    on_env_error: str | None = None,
     data: str | Path | None = None,
     changes: Mapping[str, object] | None = None,
     progress: bool = False,
@@ -150,6 +156,8 @@ def train(
         num_envs: Parallel environments; default: the preset's.
         out: The run folder; default: ``runs/ENV-AGENT-seedN``.
         precision: ``f32`` or ``bf16``; default: the preset's.
+        on_env_error: Where an environment of others raises, hangs, ends its process or shows what
+            is not finite: ``stop`` (default) after a checkpoint, or ``restart`` it.
         data: Name or folder of a Minari dataset of this environment, which the replay holds from
             the beginning; with the setting ``collect=False`` nothing else is learned from.
         changes: Other settings, as in `configure`.
@@ -163,6 +171,7 @@ def train(
         OSError: A file cannot be written; the checkpoints before are kept.
     """
     named = {"steps": steps, "num_envs": num_envs, "precision": precision}
+    named |= {"on_env_error": on_env_error}
     given = {name: value for name, value in named.items() if value is not None}
     config = configure(env, agent, preset, seed, {**(changes or {}), **given}, data)
     folder = RunFolder(Path(out or Path("runs") / run_name(config.env, config.agent, seed)))
@@ -180,6 +189,7 @@ def resume(
     progress: bool = False,
     devices: int | None = None,
     from_step: int | None = None,
+    on_env_error: str | None = None,
 ) -> Run:
     """Continue a run from its newest checkpoint, bit for bit.
 
@@ -188,6 +198,8 @@ def resume(
         steps: New total of environment steps; default: the run's own.
         progress: Whether to report on standard error.
         devices: New number of accelerators, which changes rounding; default: the run's own.
+        on_env_error: ``stop`` or ``restart``, what a broken environment of others does; default:
+            as before.
         from_step: Step of an older checkpoint to go on from, 0 to start anew; checkpoints after
             it are renamed and kept.
 
@@ -206,6 +218,7 @@ def resume(
             config.train,
             steps=config.train.steps if steps is None else int(steps),
             devices=config.train.devices if devices is None else int(devices),
+            on_env_error=on_env_error or config.train.on_env_error,
         )
         config = dataclasses.replace(config, train=train)
         number = _chosen(folder, config, from_step)

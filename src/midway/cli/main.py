@@ -34,6 +34,7 @@ def train(
     num_envs: OptionalCount = None,
     out: Path | None = None,
     precision: Literal["f32", "bf16"] | None = None,
+    on_env_error: Literal["stop", "restart"] | None = None,
     data: str | None = None,
     set: tuple[str, ...] = (),
     about: AboutEnv = NOTHING,
@@ -49,6 +50,7 @@ def train(
         num_envs: Parallel environments; default: the preset's.
         out: Run folder; default: runs/ENV-AGENT-seedN.
         precision: Matrix products in float32 or bfloat16; default: the preset's.
+        on_env_error: What a broken environment of others does: stop the run (default) or restart.
         data: Minari dataset (name or folder) that the replay begins with; with --set collect=False
             nothing else is learned from.
         set: Other settings of the preset, as NAME=VALUE.
@@ -65,6 +67,7 @@ def train(
         num_envs=num_envs,
         out=out,
         precision=precision,
+        on_env_error=on_env_error,
         data=data,
         changes=settings(set),
         progress=True,
@@ -100,6 +103,7 @@ def resume(
     steps: OptionalCount = None,
     devices: OptionalCount = None,
     from_: Annotated[OptionalCount, arg(name="from")] = None,
+    on_env_error: Literal["stop", "restart"] | None = None,
 ) -> None:
     """Continue a run from its newest checkpoint.
 
@@ -108,10 +112,12 @@ def resume(
         steps: New total of environment steps; default: the run's own.
         devices: New number of accelerators; default: the run's own.
         from_: Step of the checkpoint, 0 to start anew; later ones are renamed and kept.
+        on_env_error: What a broken environment of others does from now on: stop the run or restart.
     """
     from midway import api
 
-    _say_where(api.resume(run, steps=steps, devices=devices, progress=True, from_step=from_))
+    given = {"steps": steps, "devices": devices, "from_step": from_}
+    _say_where(api.resume(run, **given, on_env_error=on_env_error, progress=True))
 
 
 def evaluate(

@@ -29,7 +29,7 @@ FORMAT = 3
 SEALED_SINCE = 3
 """The first format whose files all have checksums."""
 
-OUTSIDE = ("steps", "devices")
+OUTSIDE = ("steps", "devices", "on_env_error")
 """Settings that may change when a run is continued."""
 
 

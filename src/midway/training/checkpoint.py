@@ -270,11 +270,13 @@ class Checkpoints:
             return {}
 
     def _stored(self, step: int, like: Stored) -> Stored:
-        """Return ``like`` without the sums that checkpoints of earlier versions do not have."""
-        if "logged" in self._metadata(step).get("collector", {}):
-            return like
-        kept = {name: part for name, part in like["collector"].items() if name != "logged"}
-        return {**like, "collector": kept}
+        """Return ``like`` without the counts that checkpoints of earlier versions do not have."""
+        there = self._metadata(step).get("collector", {})
+        parts = {name: part for name, part in like["collector"].items() if name in there}
+        if "counts" in parts:
+            counts = parts["counts"].items()
+            parts["counts"] = {n: count for n, count in counts if n in there["counts"]}
+        return {**like, "collector": parts}
 
 
 def steps_in(folder: Path) -> list[int]:
