@@ -119,7 +119,12 @@ def test_several_agents_and_seeds_and_a_run_in_progress(ris_run, sac_run, copy_r
     (runs[1] / "policy.safetensors").unlink()
     page, *figures = report([*runs, runs[0]], tmp_path / "out")
     names = {figure.stem.removeprefix("point-u-") for figure in figures}
-    assert names == FIGURES - {"ris-values"} | {"sac-map", "ris-sac-values", "comparison"}
+    assert names == FIGURES - {"ris-values"} | {
+        "sac-map",
+        "sac-failures",
+        "ris-sac-values",
+        "comparison",
+    }
     words = "".join(Page(page).words)
     assert "RIS, seed 1: unfinished, 800 of 1,200 steps" in words
     assert "RIS, seed 1: no policy saved yet" in words
