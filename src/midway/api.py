@@ -52,6 +52,7 @@ def train(
     num_envs: int | None = None,
     out: str | Path | None = None,
     precision: str | None = None,
+    on_env_error: str | None = None,
     data: str | Path | None = None,
     changes: Mapping[str, object] | None = None,
     progress: bool = False,
@@ -72,6 +73,8 @@ def train(
         out: The run folder; default: ``runs/ENV-AGENT-seedN``, with a number behind it where that
             is taken.
         precision: ``f32`` or ``bf16``; default: the preset's.
+        on_env_error: Where an environment of others raises, hangs, ends its process or shows what
+            is not finite: ``stop`` (default) after a checkpoint, or ``restart`` it.
         data: Name or folder of a Minari dataset of this environment, which the replay holds from
             the beginning; with the setting ``collect=False`` nothing else is learned from.
         changes: Other settings, as in `configure`.
@@ -90,6 +93,7 @@ def train(
         OSError: A file cannot be written; the checkpoints before are kept.
     """
     named = {"steps": steps, "num_envs": num_envs, "precision": precision, "stop_at": stop_at}
+    named |= {"on_env_error": on_env_error}
     given = {name: value for name, value in named.items() if value is not None}
     config = configure(env, agent, preset, seed, {**(changes or {}), **given}, data)
     path = Path("runs") / run_name(config.env, config.agent, seed)
@@ -112,6 +116,7 @@ def resume(
     from_step: int | None = None,
     stop_at: float | None = None,
     callbacks: Sequence[Callback] = (),
+    on_env_error: str | None = None,
 ) -> Run:
     """Continue a run from its newest checkpoint, bit for bit.
 
@@ -122,6 +127,8 @@ def resume(
         steps: New total of environment steps; default: the run's own.
         progress: Whether to report on standard error.
         devices: New number of accelerators, which changes rounding; default: the run's own.
+        on_env_error: ``stop`` or ``restart``, what a broken environment of others does; default:
+            as before.
         from_step: Step of an older checkpoint to go on from, 0 to start anew; checkpoints after
             it are renamed and kept.
         stop_at: New success that ends the run; default: the run's own.
@@ -138,7 +145,8 @@ def resume(
     folder.load_config()  # a folder that is no run's is refused without a lock in it
     with folder.lock():
         config = folder.load_config()
-        new = {"steps": steps, "devices": devices, "stop_at": stop_at}
+        new: dict[str, object] = {"steps": steps, "devices": devices}
+        new |= {"stop_at": stop_at, "on_env_error": on_env_error}
         given = {name: value for name, value in new.items() if value is not None}
         train = changed(config.train, given)
         goes_on = any(value is not None for value in (steps, stop_at, from_step))

@@ -24,6 +24,7 @@ def goal_env(
     success_function: str | Callable[..., object] | None = None,
     max_episode_steps: int | None = None,
     action_bound: float | None = None,
+    step_seconds: float = Settings.step_seconds,
     kwargs: Mapping[str, object] | None = None,
     imports: Sequence[str] = (),
 ) -> Foreign:
@@ -37,6 +38,8 @@ def goal_env(
             ``module:function``.
         max_episode_steps: Steps of an episode, in place of the registered limit.
         action_bound: Bounds of actions that have none.
+        step_seconds: Seconds that a step or a reset of all copies may take where other processes
+            step them: one that takes longer is taken for hanging.
         kwargs: Keyword arguments of the environment.
         imports: Modules to import first, which register environments.
 
@@ -44,7 +47,9 @@ def goal_env(
         ConfigurationError: It cannot be made, is no goal environment, has no limit, or does not
             say when a goal is reached; the text says what to give.
     """
-    said = Settings(success_distance, success_function, max_episode_steps, action_bound)
+    said = Settings(
+        success_distance, success_function, max_episode_steps, action_bound, step_seconds
+    )
     return foreign.admit(foreign.describe(env, said, kwargs, tuple(imports)))
 
 

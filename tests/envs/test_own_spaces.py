@@ -82,11 +82,13 @@ def test_observations_that_are_not_the_environments_are_refused(foreign: bool) -
         own_spaces.seen(spec, described, shown | {"desired_goal": np.zeros((1, 1, 9))})
 
 
-def test_an_exported_policy_takes_and_gives_what_the_environment_does(tmp_path: Path) -> None:
-    def hidden() -> Any:
-        low, high = np.array([-2, 10], np.float32), np.array([0, 30], np.float32)
-        return gymnasium.wrappers.RescaleAction(fakes.Hidden(), low, high)
+def hidden() -> Any:
+    """Return an environment with bounds of its own, whose observations lack the goal."""
+    low, high = np.array([-2, 10], np.float32), np.array([0, 30], np.float32)
+    return gymnasium.wrappers.RescaleAction(fakes.Hidden(), low, high)
 
+
+def test_an_exported_policy_takes_and_gives_what_the_environment_does(tmp_path: Path) -> None:
     foreign = describe(hidden)
     config = configure(foreign, "sac", changes={"hidden": (8,)})
     agent = registry.get("sac")

@@ -40,6 +40,7 @@ def train(
     num_envs: OptionalCount = None,
     out: Path | None = None,
     precision: Literal["f32", "bf16"] | None = None,
+    on_env_error: Literal["stop", "restart"] | None = None,
     data: str | None = None,
     stop_at: float | None = None,
     overwrite: bool = False,
@@ -60,6 +61,7 @@ def train(
         num_envs: Parallel environments; default: the preset's.
         out: Run folder; default: runs/ENV-AGENT-seedN.
         precision: Matrix products in float32 or bfloat16; default: the preset's.
+        on_env_error: What a broken environment of others does: stop the run (default) or restart.
         data: Minari dataset (name or folder) that the replay begins with; with --set collect=False
             nothing else is learned from.
         stop_at: Success of the task that is shown (hard, if there is one) that ends the run once
@@ -85,6 +87,7 @@ def train(
         num_envs=num_envs,
         out=out,
         precision=precision,
+        on_env_error=on_env_error,
         data=data,
         changes=settings(set),
         progress=True,
@@ -102,6 +105,7 @@ def resume(
     from_: Annotated[OptionalCount, arg(name="from")] = None,
     stop_at: float | None = None,
     wandb: str | None = None,
+    on_env_error: Literal["stop", "restart"] | None = None,
 ) -> None:
     """Continue a run from its newest checkpoint.
 
@@ -112,6 +116,7 @@ def resume(
         from_: Step of the checkpoint, 0 to start anew; later ones are renamed and kept.
         stop_at: New success that ends the run; 0: none.
         wandb: Project of Weights & Biases that is shown the run too.
+        on_env_error: What a broken environment of others does from now on: stop the run or restart.
     """
     from midway import api
     from midway.runs.tracking import watching
@@ -123,6 +128,7 @@ def resume(
         progress=True,
         from_step=from_,
         stop_at=stop_at,
+        on_env_error=on_env_error,
         callbacks=watching(wandb),
     )
     _say_where(continued)

@@ -202,5 +202,5 @@ def last_success(evaluation: Path) -> tuple[int | None, Estimate | None]:
         row = np.flatnonzero(hard if hard.any() else last)[0]
         success = of_policy(table["success_rate"][row], table["episodes"][row])
         return int(table["step"][row]), success
-    except (ConfigurationError, KeyError, IndexError, ValueError):
+    except (ConfigurationError, KeyError, IndexError, ValueError, OverflowError):
         return None, None

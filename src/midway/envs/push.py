@@ -139,8 +139,7 @@ class PushStateVectorEnv(SimulationVectorEnv):
         moved = self._targets + ACTION_SCALE * np.clip(actions, -1, 1)
         self._targets[:] = np.clip(moved, HAND_BOX.low, HAND_BOX.high)
 
-    def _advance(self, actions: Shaped[Array, "num_envs 2"]) -> None:
-        self._apply(actions)
+    def _simulate(self) -> None:
         # The stage makes the positions of bodies those of the new state.
         self.batch.step(nstep=self.substeps, stage=POSITIONS)
 

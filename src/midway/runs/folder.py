@@ -15,6 +15,7 @@ from midway.envs.foreign import Foreign
 from midway.envs.layouts import Layout
 from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
+from midway.plain import check_kinds
 from midway.runs import lock
 from midway.runs.provenance import provenance
 from midway.settings import changed
@@ -28,7 +29,7 @@ FORMAT = 3
 SEALED_SINCE = 3
 """The first format whose files all have checksums."""
 
-OUTSIDE = ("steps", "devices", "stop_at")
+OUTSIDE = ("steps", "devices", "stop_at", "on_env_error")
 """Settings that may change when a run is continued."""
 
 
@@ -59,6 +60,17 @@ class RunConfig:
     maze: JsonObject | None = None
     data: str | None = None
 
+    def __post_init__(self) -> None:
+        """Check the seed.
+
+        Raises:
+            ConfigurationError: It is none.
+        """
+        if type(self.seed) is not int or not 0 <= self.seed < 2**63:
+            raise ConfigurationError(
+                f"seed {self.seed!r}: must be a whole number from 0 to 2**63 - 1"
+            )
+
     def declaration(self) -> Declaration:
         """Return the declaration of the environment.
 
@@ -66,7 +78,7 @@ class RunConfig:
             ConfigurationError: It cannot be found.
         """
         if self.maze is not None:
-            return environments.own_maze(self.maze["robot"], Layout.from_json(self.maze))
+            return environments.own_maze(str(self.maze.get("robot")), Layout.from_json(self.maze))
         if self.foreign is None:
             return environments.entry(self.env)
         return environments.entry(Foreign.from_json(self.foreign))
@@ -98,7 +110,7 @@ class RunConfig:
         try:
             values = _of_this_format(values)
             agent = registry.get(values["agent"])
-            return RunConfig(
+            config = RunConfig(
                 env=values["env"],
                 agent=values["agent"],
                 preset=values["preset"],
@@ -109,8 +121,10 @@ class RunConfig:
                 maze=values.get("maze"),
                 data=values.get("data"),
             )
+            check_kinds(config)
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigurationError(f"configuration not understood: {error}") from error
+        return config
 
 
 def _of_this_format(values: JsonObject) -> JsonObject:
@@ -327,12 +341,12 @@ def read_json(path: Path) -> JsonObject:
         ConfigurationError: The file cannot be read, holds no JSON object, or was changed.
     """
     try:
-        values = json.loads(path.read_text())
+        values = files.parsed(path.read_text())
     except OSError as error:
         raise ConfigurationError(
             f"{path.parent} is no readable run folder: {path.name}: {error.strerror}"
         ) from error
-    except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, absurd numbers or depth
+    except ValueError as error:  # no JSON, no UTF-8, absurd numbers or depth
         raise ConfigurationError(f"{path} is damaged: {error}") from error
     if not isinstance(values, dict):
         raise ConfigurationError(f"{path} is damaged: it holds no JSON object")

@@ -71,11 +71,11 @@ def advance(training: Training) -> None:
     if train.collect:
         choose = partial(_choose, training)
         training.replay = training.collector.step(training.replay, choose)
-        if not training.collector.moved:
-            return
     if (begun := training.collector.begun).any():
         fresh = training.begin_episodes(train.num_envs)
         training.memory = acting.renew(training.memory, fresh, begun)
+    if not training.collector.moved:
+        return
     steps, updates = training.counters.steps + train.num_envs, training.counters.updates
     while train.updates_due(steps) - updates >= train.updates_per_call:
         training.arrays, training.totals = training.program.train(
