@@ -57,7 +57,11 @@ class Block(NamedTuple):
 
 def blocks(page: Path) -> list[Block]:
     found = re.findall(r"^```(.*)\n((?:.*\n)*?)```$", page.read_text(), re.MULTILINE)
-    return [Block(*[*info.split(), "", ""][:2], text) for info, text in found]
+    words = [[*info.split(), "", ""][:2] for info, _ in found]
+    return [
+        Block(language, "" if language.startswith("{") else file, text)
+        for (language, file), (_, text) in zip(words, found, strict=True)
+    ]
 
 
 def commands(text: str) -> list[tuple[dict[str, str], list[str]]]:
