@@ -231,14 +231,9 @@ def keep_best(
 ) -> None:
     """Write the weights to ``policies/best.safetensors``, with what confirmed them."""
     folder.past_policies.mkdir(exist_ok=True)
-    _save_weights(
-        folder.best_weights,
-        folder.identity(config),
-        training,
-        task=confirmed.task,
-        success_rate=confirmed.success_rate,
-        episodes=len(confirmed.episodes),
-    )
+    rate, episodes = confirmed.success_rate, len(confirmed.episodes)
+    about = {"task": confirmed.task, "success_rate": rate, "episodes": episodes}
+    _save_weights(folder.best_weights, folder.identity(config), training, **about)
 
 
 def best(folder: RunFolder) -> Best | None:
