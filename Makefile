@@ -15,7 +15,7 @@ COVERAGE := --cov=midway
 
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: train check test test-all test-lowest tested site docs lint format clean
+.PHONY: train check test test-all test-lowest tested site docs wheel release-check lint format clean
 
 # The tested set: newer releases of what midway needs come in through constraints.txt alone.
 $(VENV)/installed: pyproject.toml constraints.txt
@@ -25,7 +25,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/installed-extras: $(VENV)/installed
-	$(INSTALL) '.[dev,cluster,data,docs,robotics]'
+	$(INSTALL) '.[dev,cluster,data,docs,onnx,robotics,tune]'
 	touch $@
 
 # Typed again, it continues where it was stopped.
@@ -63,6 +63,14 @@ test-lowest:
 	$(VENV)-lowest/bin/python -m pip install --quiet --editable '.[dev,cluster]' \
 		--constraint $(VENV)-lowest/constraints.txt
 	$(VENV)-lowest/bin/pytest --numprocesses auto --dist loadfile $(QUICK) tests/envs/test_mazes.py tests/envs/test_point_maze.py
+
+# Source distribution and wheel, into dist/.
+wheel: $(VENV)/installed
+	$(BIN)/python -m build --outdir dist .
+
+# Builds both, and uses the wheel outside the checkout as a newcomer would.
+release-check: $(VENV)/installed
+	$(BIN)/pytest tests/test_release.py
 
 # After `pip install --upgrade` and `make test-all`: what constraints.txt is to hold.
 tested: $(VENV)/installed-extras

@@ -26,10 +26,10 @@ SEEDS = range(5)
 F32 = ("--precision", "f32")
 BF16 = ("--precision", "bf16")
 ROBOTICS = {
-    "PandaReach-v3": 20_000,
-    "PointMaze_UMaze-v3": 24_000,
-    "PointMaze_Medium-v3": 48_000,
-    "FetchReach-v4": 20_000,
+    "PandaReach-v3": 12_000,
+    "PointMaze_UMaze-v3": 16_000,
+    "PointMaze_Medium-v3": 40_000,
+    "FetchReach-v4": 12_000,
 }
 """Environment steps on the environments of others; 50 episodes an evaluation take their time."""
 SUITES: dict[str, list[Job]] = {

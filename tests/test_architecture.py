@@ -16,13 +16,14 @@ FILES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init
 """All but the public face, ``midway/__init__.py``, which may name anything."""
 
 FLOORS = (
-    {"errors"},
+    {"errors", "plain"},
     {"types", "files"},
     {"settings", "functional", "tables", "agent", "statistics"},
     {"networks", "replay", "envs", "planning"},
     {"agents"},
     {"training"},
-    {"runs", "presets"},
+    {"runs", "presets", "spaces"},
+    {"configuration"},
     {"api"},
     {"reports", "cluster", "bench"},
     {"cli"},
@@ -147,7 +148,16 @@ LOOP = ["arrays", "collect", "evaluate", "freeze", "loop", "seeds", "state", "st
 def test_the_loop_knows_neither_agents_nor_environments(module):
     path = SOURCE.joinpath(*module.split(".")).with_suffix(".py")
     rooms = {target.split(".")[1] for target in imports_of(path) if target.startswith("midway.")}
-    containers = {"errors", "types", "files", "functional", "agent", "tables", "statistics"}
+    containers = {
+        "errors",
+        "plain",
+        "types",
+        "files",
+        "functional",
+        "agent",
+        "tables",
+        "statistics",
+    }
     assert rooms <= containers | {"replay", "training"}
 
 
@@ -237,7 +247,7 @@ def test_a_symbol_is_found_wherever_it_is_used():
 
 AGENT_NAMES = {*AGENTS, "crl"}
 MAY_NAME_AGENTS = {"agents.registry", "presets"}
-MAY_DEFAULT_TO_AGENTS = {"api", "cli", "bench"}
+MAY_DEFAULT_TO_AGENTS = {"configuration", "api", "cli", "bench"}
 """Rooms whose calls and default arguments may choose an agent; none may compare one."""
 
 GUESS = re.compile(rf"^({'|'.join({e.family for e in ENVIRONMENTS.values()})})(-.*)?$")

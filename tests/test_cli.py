@@ -1,6 +1,8 @@
 """The command line as a user types it, bad input included."""
 
+import importlib.metadata
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +10,10 @@ from pathlib import Path
 import pytest
 
 import midway
+from midway import presets
+from midway.agents.registry import AGENTS
 from midway.cli.main import main
+from midway.runs.folder import RunFolder
 
 TINY = ["hidden=(8,)", "batch_size=8", "num_envs=4", "random_steps=16", "replay_capacity=2000"]
 TINY += ["evaluate_every=60", "evaluation_episodes=2", "log_every=20", "checkpoint_every=60"]
@@ -78,6 +83,56 @@ def test_envs_and_doctor(capsys: pytest.CaptureFixture[str]) -> None:
     assert checks["device"]["ok"]
 
 
+def test_version_and_help_say_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "--version")
+    assert (status, out) == (0, f"midway {importlib.metadata.version('midway')}\n")
+    status, out, _ = run(capsys, "train", "--help")
+    words = " ".join(out.replace("│", " ").split())
+    assert status == 0
+    for said in (*AGENTS, *presets.NAMES, "midway presets", "midway envs", "--stop-at"):
+        assert said in words
+
+
+def test_runs_are_listed_with_their_states(
+    capsys: pytest.CaptureFixture[str], trained: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(trained, tmp_path / "whole")
+    for name in ("begun", "busy", "sweep/damaged"):
+        (tmp_path / name).mkdir(parents=True)
+        shutil.copy(trained / "config.json", tmp_path / name)
+    (tmp_path / "sweep/damaged/config.json").write_text("{")
+    with RunFolder(tmp_path / "busy").lock():
+        status, out, _ = run(capsys, "runs", str(tmp_path), "--json")
+    found = {Path(name).name: row for name, row in json.loads(out).items()}
+    assert status == 0
+    states = {name: row["state"] for name, row in found.items()}
+    expected = {"whole": "finished", "begun": "interrupted", "busy": "running"}
+    assert states == expected | {"damaged": "broken"}
+    assert found["whole"]["success"] is not None
+    assert found["whole"]["step"] == found["whole"]["steps"]
+    status, out, _ = run(capsys, "runs", str(tmp_path))
+    assert len(out.splitlines()) == 4
+    assert "is damaged" in out
+    status, out, _ = run(capsys, "runs", str(tmp_path / "whole"))
+    assert out.startswith(str(tmp_path / "whole"))
+    status, _, err = run(capsys, "runs", str(tmp_path / "nowhere"))
+    assert status == 2
+    assert "there is no folder" in err
+
+
+def test_export_writes_files_and_says_how_far_they_are_off(
+    capsys: pytest.CaptureFixture[str], trained: Path, tmp_path: Path
+) -> None:
+    arguments = ["export", str(trained), "--out", str(tmp_path)]
+    status, out, _ = run(capsys, *arguments, "--numpy")
+    assert status == 0
+    assert out.startswith(f"{tmp_path}/policy.py: actions within ")
+    assert {path.name for path in tmp_path.iterdir()} == {"policy.py", "policy.npz"}
+    status, _, err = run(capsys, *arguments)
+    assert status == 2
+    assert "--onnx" in err
+
+
 def test_bench_prints_figures_with_the_machine(capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = run(capsys, "bench", "env", "--env", "point-u", "--num-envs", "2", "--json")
     values = json.loads(out)
@@ -98,6 +153,8 @@ def test_bench_prints_figures_with_the_machine(capsys: pytest.CaptureFixture[str
         (["train", "point-u", "--stepz", "5"], "--stepz"),
         (["train", "point-u", "--steps", "1.5"], "1.5"),
         (["train", "point-u", "--steps", "-5"], "-5"),
+        (["train", "point-u", "--stop-at", "95"], "stop_at 95"),
+        (["train", "point-u", "--overwrite", "--out", "/proc/self"], "/proc/self"),
         (["train", "point-u", "--precision", "f16"], "f16"),
         (["train", "point-u", "--set", "batch"], "batch"),
         (["train", "point-u", "--set", "batches=3"], "batches"),

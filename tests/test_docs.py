@@ -19,6 +19,7 @@ from midway import presets, settings
 from midway.agents.registry import AGENTS
 from midway.cli.main import main
 from midway.envs.registry import ENVIRONMENTS
+from midway.spaces import SPACE, Choice, Range
 from midway.training.collect import EpisodeCounts
 from midway.training.logging import EVALUATION_COLUMNS
 from midway.types import Batch, DistanceTask, EnvSpec, Subgoal
@@ -37,7 +38,7 @@ SMALL = {
     "num_envs": 4,
     "random_steps": 40,
     "updates_per_step": 0.5,
-    "replay_capacity": 2_000,
+    "replay_capacity": 5_000,
     "evaluate_every": 60,
     "evaluation_episodes": 2,
     "log_every": 20,
@@ -138,7 +139,11 @@ def test_the_blocks_of_a_page_run_in_their_order(
 def table(page: str, heading: str) -> list[list[str]]:
     """Return the rows of the first table below a heading of a page, without its head."""
     _, _, below = (DOCS / page).read_text().partition(f"\n## {heading}\n")
-    lines = re.findall(r"^\|(.*)\|$", below.partition("\n## ")[0], re.MULTILINE)
+    return _rows(below.partition("\n## ")[0])
+
+
+def _rows(text: str) -> list[list[str]]:
+    lines = re.findall(r"^\|(.*)\|$", text, re.MULTILINE)
     rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)] for line in lines]
     return rows[2:]
 
@@ -180,3 +185,25 @@ def test_the_columns_of_every_run_are_on_the_page() -> None:
     assert said == {*EpisodeCounts().metrics(), *logged}
     text = (DOCS / "metrics.md").read_text().partition("## `evaluation.csv`")[2]
     assert set(EVALUATION_COLUMNS) <= set(names(text))
+
+
+def test_the_search_space_is_on_the_page() -> None:
+    said: dict[str, Range | Choice] = {}
+    for cell, low, high in table("tuning.md", "What is tried"):
+        for name in names(cell):
+            if high == "on":
+                said[name] = Choice((False, True))
+            elif high:
+                said[name] = Range(float(low), float(high), log=True)
+            else:
+                said[name] = Choice(tuple(int(value) for value in low.split(",")))
+    assert said == SPACE
+
+
+def test_each_claim_of_the_comparison_names_a_test_that_exists() -> None:
+    rows = [row for row in _rows((DOCS / "comparison.md").read_text()) if row[0] != "made for"]
+    assert len(rows) > 10
+    for row in rows:
+        (name,) = [name for name in names(row[1]) if name.startswith("tests/")]
+        file, _, test = name.partition("::")
+        assert f"\ndef {test}(" in (ROOT / file).read_text(), name

@@ -13,8 +13,12 @@ _PUBLIC = {
     "resume": "midway.api",
     "load": "midway.api",
     "evaluate": "midway.api",
-    "goal_env": "midway.api",
-    "maze_env": "midway.api",
+    "goal_env": "midway.configuration",
+    "maze_env": "midway.configuration",
+    "push": "midway.runs.hub",
+    "pull": "midway.runs.hub",
+    "report": "midway.reports",
+    "watch": "midway.reports",
     "make_vec": "midway.envs.registry",
 }
 

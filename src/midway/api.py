@@ -1,30 +1,30 @@
 """The Python interface: train, resume, load, evaluate."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 
-from midway import presets
 from midway.agent import AnyAgent
-from midway.agents import registry as agents
-from midway.envs import datasets, foreign, layouts
-from midway.envs import registry as environments
-from midway.envs.foreign import EnvLike, Foreign, Settings
+from midway.configuration import configure as configure
+from midway.configuration import setup_of as setup_of
+from midway.envs.foreign import EnvLike
 from midway.envs.registry import Declaration
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
 from midway.runs import complete
 from midway.runs import policy as policies
+from midway.runs.callbacks import Callback, Watchers
 from midway.runs.folder import RunConfig, RunFolder, run_name
+from midway.runs.place import clear, free_folder
 from midway.runs.policy import Policy, Which
+from midway.runs.sinks import RunSinks
+from midway.settings import changed
 from midway.training import loop, seeds, signals, state
 from midway.training.checkpoint import Checkpoints, steps_in
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.logging import Logger
-from midway.training.progress import Reporter, Silent, reporter
+from midway.training.progress import Reporter, Silent, reporter, stages_of
 from midway.training.state import Training
-from midway.types import Trajectory, VectorGoalEnv
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,97 +33,13 @@ class Run:
 
     Attributes:
         path: The run folder.
-        finished: Whether all steps were taken.
+        finished: Whether all steps were taken, or it was ended early as it should be.
         signal: The signal that ended it before, if one did.
     """
 
     path: Path
     finished: bool
     signal: int | None = None
-
-
-def goal_env(
-    env: EnvLike,
-    *,
-    success_distance: float | None = None,
-    success_function: str | Callable[..., object] | None = None,
-    max_episode_steps: int | None = None,
-    action_bound: float | None = None,
-    kwargs: Mapping[str, object] | None = None,
-    imports: Sequence[str] = (),
-) -> Foreign:
-    """Return an environment that is not midway's, with what midway must be told of it.
-
-    Args:
-        env: ``Id``, ``module:Id``, ``module:callable``, what ``gymnasium.make`` returned, or a
-            class or function that makes it.
-        success_distance: Distance between the goals below which one counts as reached.
-        success_function: Function of achieved and desired goals that says so, or its
-            ``module:function``.
-        max_episode_steps: Steps of an episode, in place of the registered limit.
-        action_bound: Bounds of actions that have none.
-        kwargs: Keyword arguments of the environment.
-        imports: Modules to import first, which register environments.
-
-    Raises:
-        ConfigurationError: It cannot be made, is no goal environment, has no limit, or does not
-            say when a goal is reached; the text says what to give.
-    """
-    said = Settings(success_distance, success_function, max_episode_steps, action_bound)
-    return foreign.admit(foreign.describe(env, said, kwargs, tuple(imports)))
-
-
-def maze_env(robot: str, maze: str | Path) -> Declaration:
-    """Return an environment of a robot in a maze of one's own, for `train` and `make_vec`.
-
-    Args:
-        robot: ``point`` or ``ant``.
-        maze: A file of letters (``#`` wall, ``.`` free, ``S`` start and ``G`` goal of the hard
-            task), or of YAML with them as ``map`` and the side of a cell as ``cell`` (m); or
-            ``umaze`` or ``medium``, which are gymnasium-robotics'.
-
-    Raises:
-        ConfigurationError: There is no such robot, or the file holds no map of a maze.
-    """
-    return environments.own_maze(robot, layouts.read(maze))
-
-
-def configure(
-    env: EnvLike | Declaration,
-    agent: str | AnyAgent = "ris",
-    preset: str = "quick",
-    seed: int = 0,
-    changes: Mapping[str, object] | None = None,
-    data: str | Path | None = None,
-) -> RunConfig:
-    """Return a preset with some values changed.
-
-    Args:
-        env: Environment name, another environment, or its declaration.
-        agent: Agent name, ``package.module:NAME``, or the agent itself.
-        preset: ``paper``, ``quick``, or the path of a preset file.
-        seed: The one seed of every generator, from 0.
-        changes: Values by their field names in `TrainConfig` or the agent's ``Config``; text is
-            read as Python literals.
-        data: Name or folder of a Minari dataset.
-
-    Raises:
-        ConfigurationError: A name is unknown or a value is not allowed.
-    """
-    if type(seed) is not int or not 0 <= seed < 2**63:
-        raise ConfigurationError(f"seed {seed!r}: must be a whole number from 0 to 2**63 - 1")
-    name = agents.name_of(agent)
-    declared = environments.entry(env)
-    resolved = presets.resolve(declared, name, preset, changes)
-    parts = (preset, seed, resolved.train, resolved.hyperparameters)
-    return RunConfig(
-        declared.name,
-        name,
-        *parts,
-        foreign=declared.foreign.stored if declared.foreign else None,
-        maze={"robot": declared.family, **declared.layout.to_json()} if declared.layout else None,
-        data=None if data is None else str(data),
-    )
 
 
 def train(
@@ -136,9 +52,13 @@ def train(
     num_envs: int | None = None,
     out: str | Path | None = None,
     precision: str | None = None,
+    on_env_error: str | None = None,
     data: str | Path | None = None,
     changes: Mapping[str, object] | None = None,
     progress: bool = False,
+    stop_at: float | None = None,
+    callbacks: Sequence[Callback] = (),
+    overwrite: bool = False,
 ) -> Run:
     """Train an agent on an environment and write a run folder.
 
@@ -150,12 +70,20 @@ def train(
         steps: Environment steps; default: the preset's.
         seed: The one seed of every generator.
         num_envs: Parallel environments; default: the preset's.
-        out: The run folder; default: ``runs/ENV-AGENT-seedN``.
+        out: The run folder; default: ``runs/ENV-AGENT-seedN``, with a number behind it where that
+            is taken.
         precision: ``f32`` or ``bf16``; default: the preset's.
+        on_env_error: Where an environment of others raises, hangs, ends its process or shows what
+            is not finite: ``stop`` (default) after a checkpoint, or ``restart`` it.
         data: Name or folder of a Minari dataset of this environment, which the replay holds from
             the beginning; with the setting ``collect=False`` nothing else is learned from.
         changes: Other settings, as in `configure`.
         progress: Whether to report on standard error.
+        stop_at: Success of the task that is shown (``hard``, if there is one), with mean actions,
+            that ends the run once three evaluations in a row have reached it.
+        callbacks: Are called after each row of metrics and each evaluation; one that returns True
+            ends the run at this step, finished. What they raise ends it too, as a crash would.
+        overwrite: Whether a run in the folder is deleted, unless another process trains it.
 
     Raises:
         ConfigurationError: A name, value or folder cannot be used.
@@ -164,16 +92,20 @@ def train(
             is written before.
         OSError: A file cannot be written; the checkpoints before are kept.
     """
-    named = {"steps": steps, "num_envs": num_envs, "precision": precision}
+    named = {"steps": steps, "num_envs": num_envs, "precision": precision, "stop_at": stop_at}
+    named |= {"on_env_error": on_env_error}
     given = {name: value for name, value in named.items() if value is not None}
     config = configure(env, agent, preset, seed, {**(changes or {}), **given}, data)
-    folder = RunFolder(Path(out or Path("runs") / run_name(config.env, config.agent, seed)))
+    path = Path("runs") / run_name(config.env, config.agent, seed)
+    folder = RunFolder(Path(out or (path if overwrite else free_folder(path))))
     setup = setup_of(config, folder)
     state.check(setup)
+    if overwrite:
+        clear(folder)
     folder.prepare()
     with folder.lock():
         folder.create(config)
-        return _run_locked(config, folder, setup, progress, None)
+        return _run_locked(config, folder, setup, (progress, callbacks), None)
 
 
 def resume(
@@ -182,16 +114,25 @@ def resume(
     progress: bool = False,
     devices: int | None = None,
     from_step: int | None = None,
+    stop_at: float | None = None,
+    callbacks: Sequence[Callback] = (),
+    on_env_error: str | None = None,
 ) -> Run:
     """Continue a run from its newest checkpoint, bit for bit.
+
+    A run that was ended early is finished; it goes on if one of steps, step or success is given.
 
     Args:
         path: The run folder.
         steps: New total of environment steps; default: the run's own.
         progress: Whether to report on standard error.
         devices: New number of accelerators, which changes rounding; default: the run's own.
+        on_env_error: ``stop`` or ``restart``, what a broken environment of others does; default:
+            as before.
         from_step: Step of an older checkpoint to go on from, 0 to start anew; checkpoints after
             it are renamed and kept.
+        stop_at: New success that ends the run; default: the run's own.
+        callbacks: As `train`.
 
     Raises:
         ConfigurationError: This is no run folder, another process trains it, its checkpoint is
@@ -204,18 +145,20 @@ def resume(
     folder.load_config()  # a folder that is no run's is refused without a lock in it
     with folder.lock():
         config = folder.load_config()
-        train = dataclasses.replace(
-            config.train,
-            steps=config.train.steps if steps is None else int(steps),
-            devices=config.train.devices if devices is None else int(devices),
-        )
+        new: dict[str, object] = {"steps": steps, "devices": devices}
+        new |= {"stop_at": stop_at, "on_env_error": on_env_error}
+        given = {name: value for name, value in new.items() if value is not None}
+        train = changed(config.train, given)
+        goes_on = any(value is not None for value in (steps, stop_at, from_step))
         config = dataclasses.replace(config, train=train)
         number = _chosen(folder, config, from_step)
         setup = setup_of(config, folder)
         state.check(setup)
+        if goes_on:
+            folder.note_end(None)
         if number is None:
             folder.note_resume(config)
-        return _run_locked(config, folder, setup, progress, number)
+        return _run_locked(config, folder, setup, (progress, callbacks), number)
 
 
 def load(path: str | Path, policy: Which = "last") -> Policy:
@@ -261,90 +204,9 @@ def evaluate(
     declared = loaded.config.declaration()
     task = task or declared.shown_task
     env = declared.factory(num_envs=episodes, task=task)
-    return run_episodes(env, loaded.actor(actions, seed), task, actions, seeds.evaluation(seed))
-
-
-def setup_of(config: RunConfig, folder: RunFolder) -> state.Setup:
-    """Return what the run of this configuration is made of; nothing is written."""
-    declared = config.declaration()
-
-    def make_env(num_envs: int, task: str) -> VectorGoalEnv:
-        return declared.factory(num_envs=num_envs, task=task)
-
-    agent = agents.get(config.agent)
-    parts = (config.hyperparameters, config.train, config.seed, make_env, folder.path)
-    return state.Setup(agent, *parts, _demonstrations(config, declared))
-
-
-def _demonstrations(
-    config: RunConfig, declared: Declaration
-) -> Callable[[], Iterable[Trajectory]] | None:
-    """Return what reads the trajectories of others that a run begins with.
-
-    Raises:
-        ConfigurationError: None are given where no step is taken, or for one of midway's own.
-    """
-    if config.data is None:
-        if not config.train.collect:
-            raise ConfigurationError("collect False: without --data there is nothing to learn from")
-        return None
-    if declared.foreign is None:
-        raise ConfigurationError(f"--data {config.data}: not for midway's own environments")
-    return partial(datasets.trajectories, config.data, declared.foreign)
-
-
-class RunSinks:
-    """Puts what a run says into its folder, and on the terminal.
-
-    Args:
-        config: The configuration of the run.
-        folder: Its folder.
-        logger: Its CSV and TensorBoard files.
-        checkpoints: Its checkpoints.
-        say: Its terminal.
-    """
-
-    def __init__(
-        self,
-        config: RunConfig,
-        folder: RunFolder,
-        logger: Logger,
-        checkpoints: Checkpoints,
-        say: Reporter,
-    ) -> None:
-        self._config = config
-        self._folder = folder
-        self._checkpoints = checkpoints
-        self.message, self.progress = say.message, say.advance
-        self.metrics, self.evaluation = logger.metrics, logger.evaluation
-
-    def snapshot(self, training: Training) -> None:
-        """Keep the weights of this step, for figures."""
-        policies.keep(self._folder, self._config, training)
-
-    def is_better(self, result: Evaluation) -> bool:
-        """Return whether the lower end of its interval lies above that of the best policy."""
-        best = policies.best(self._folder)
-        return result.success.low > (0.0 if best is None else best.success.low)
-
-    def best(self, training: Training, confirmed: Evaluation) -> None:
-        """Keep the policy as the best."""
-        policies.keep_best(self._folder, self._config, training, confirmed)
-
-    def checkpoint(self, training: Training) -> None:
-        """Write a checkpoint and the policy.
-
-        Raises:
-            NonFiniteError: A network is not finite; nothing is written then.
-        """
-        loop.check_finite(training)
-        stored = state.state_dict(training)
-        self._checkpoints.save(training.counters.steps, stored, training.env_spec)
-        self.policy(training)
-
-    def policy(self, training: Training) -> None:
-        """Write the policy."""
-        policies.save(self._folder, self._config, training)
+    told = stages_of("steps of the episodes", loaded.spec.max_episode_steps)
+    start = seeds.evaluation(seed)
+    return run_episodes(env, loaded.actor(actions, seed), task, actions, start, told)
 
 
 def _chosen(folder: RunFolder, config: RunConfig, from_step: int | None) -> int | None:
@@ -365,9 +227,20 @@ def _chosen(folder: RunFolder, config: RunConfig, from_step: int | None) -> int 
 
 
 def _run_locked(
-    config: RunConfig, folder: RunFolder, setup: state.Setup, progress: bool, number: int | None
+    config: RunConfig,
+    folder: RunFolder,
+    setup: state.Setup,
+    watched: tuple[bool, Sequence[Callback]],
+    number: int | None,
 ) -> Run:
     """Restore the checkpoint of a step, if one is given; then train.
+
+    Args:
+        config: The configuration of the run.
+        folder: Its folder.
+        setup: What it is made of.
+        watched: Whether to report on standard error, and the callbacks.
+        number: Step of the checkpoint.
 
     Raises:
         NonFiniteError: As `train`, with what is there to go on from.
@@ -375,11 +248,14 @@ def _run_locked(
     folder.remove_unfinished()
     checkpoints = Checkpoints(folder.checkpoints, folder.owner(config))
     checkpoints.remove_unfinished()
+    progress, callbacks = watched
     say: Reporter = reporter(config.train.steps, number or 0) if progress else Silent()
+    watchers = Watchers(config, folder, callbacks)
     try:
         with signals.listening() as asked, closing(say), closing(checkpoints):
             try:
-                finished = _run(config, folder, setup, (checkpoints, say), number, asked)
+                parts = checkpoints, say, watchers
+                finished = _run(config, folder, setup, parts, number, asked)
             except signals.Interrupted:
                 say.message(f"{folder.path}: interrupted before its first step")
                 finished = False
@@ -392,7 +268,7 @@ def _run(
     config: RunConfig,
     folder: RunFolder,
     setup: state.Setup,
-    parts: tuple[Checkpoints, Reporter],
+    parts: tuple[Checkpoints, Reporter, Watchers],
     number: int | None,
     asked: signals.Asked,
 ) -> bool:
@@ -401,7 +277,7 @@ def _run(
     Raises:
         Interrupted: A signal ended it before its first step.
     """
-    checkpoints, say = parts
+    checkpoints, say, watchers = parts
     if rule := config.rule_of_success:
         say.message(rule)
     training = state.start(setup, say.message if number is None else None, asked.check)
@@ -410,11 +286,11 @@ def _run(
         folder.note_resume(config)
     else:
         folder.best_weights.unlink(missing_ok=True)
-    steps = training.counters.steps
+    steps, training.ends_at = training.counters.steps, folder.ended_at()
     checkpoints.set_aside_after(steps)
     files = folder.metrics_file, folder.evaluation_file, folder.path / "events"
     with closing(Logger(*files, steps, say.message)) as logger:
-        sinks = RunSinks(config, folder, logger, checkpoints, say)
+        sinks = RunSinks(config, folder, logger, checkpoints, say, watchers)
         if number is not None:
             _complete(training, sinks, folder, asked)
         return loop.run(training, sinks, asked)

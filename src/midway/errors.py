@@ -13,7 +13,14 @@ class NonFiniteError(RuntimeError):
 
 
 class BrokenEnvironmentError(RuntimeError):
-    """An environment raised or shows what cannot be used; its text names copy and step."""
+    """An environment raised or shows what cannot be used; its text names copy and step.
+
+    Attributes:
+        step: What the step gave all the same, whose info ``broken`` tells which copies have no part
+            in it; None where it was not taken.
+    """
+
+    step: object = None
 
 
 class NonFiniteObservationError(BrokenEnvironmentError, NonFiniteError):

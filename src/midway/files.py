@@ -51,6 +51,18 @@ def checksum(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def parsed(text: str) -> Any:
+    """Return what JSON text holds.
+
+    Raises:
+        ValueError: It is no JSON, or nested too deeply.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
 def sealed(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return plain values with the checksum of them all."""
     return {**values, SEAL: _digest(values)}

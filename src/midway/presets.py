@@ -19,6 +19,7 @@ from midway.envs import registry as environments
 from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
 from midway.networks.mlp import fastest_precision
+from midway.plain import check_kinds
 from midway.training.config import TrainConfig
 from midway.types import Hyperparameters, RelabelMix
 
@@ -434,7 +435,9 @@ def _read(path: Path) -> tuple[str, Sequence[Rule]]:
         base = content.pop("base", "quick")
         given = content.pop("rule", [])
         rules = [Rule("*", **{"source": path.name, **rule}) for rule in given]
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        for rule in rules:
+            check_kinds(rule)
+    except (OSError, ValueError, RecursionError) as error:  # no TOML, absurd numbers or depth
         raise ConfigurationError(f"preset {path}: {error}") from error
     except (TypeError, AttributeError):
         raise ConfigurationError(

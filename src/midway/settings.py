@@ -15,6 +15,9 @@ from midway.types import Hyperparameters
 T = TypeVar("T")
 Config = TypeVar("Config", bound=Hyperparameters)
 
+MOST_NUMBERS = 64
+"""Entries of a setting that is several numbers, such as the layers of a network."""
+
 Bound: TypeAlias = int | float | None
 """A whole number stays one, so that messages show it as one."""
 
@@ -49,6 +52,8 @@ class Allowed:
             listed = ", ".join(map(str, self.choices))
             return "" if value in self.choices else f"choose one of {listed}"
         numbers = value if isinstance(value, tuple) else (value,)
+        if len(numbers) > MOST_NUMBERS:
+            return f"must be at most {MOST_NUMBERS} numbers"
         for number in numbers:
             if isinstance(number, float) and not math.isfinite(number):
                 return "must be finite"

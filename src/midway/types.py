@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
 from midway.errors import ConfigurationError
+from midway.plain import check_kinds
 
 Metrics: TypeAlias = dict[str, Float[Array, ""]]
 """Scalars on the device, named ``group/name``."""
@@ -29,6 +30,9 @@ Step: TypeAlias = tuple[Observations, NumPyArray, NumPyArray, NumPyArray, Info]
 """Observations, reward, terminated, truncated and info."""
 Options: TypeAlias = Mapping[str, Any]
 """What a user wants of a reset, checked by the environment: ``reset_mask``, ``task`` and others."""
+
+LARGEST_SIZE = 1_000_000
+"""Entries along an axis of what environments show, and steps of an episode, at most."""
 
 JsonObject: TypeAlias = dict[str, Any]
 """What a JSON file holds; whoever reads it checks the values."""
@@ -196,9 +200,36 @@ class EnvSpec:
             plain = _as_tuples(values)
             task = plain["task"]
             plain["task"] = UnknownTask() if task is None else DistanceTask(**_as_tuples(task))
-            return EnvSpec(**plain)
-        except (KeyError, TypeError, AttributeError) as error:
+            spec = EnvSpec(**plain)
+            check_kinds(spec.task)
+            check_kinds(spec)
+        except (KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ConfigurationError(f"environment not understood: {error}") from error
+        spec._check_sizes()
+        return spec
+
+    def _check_sizes(self) -> None:
+        """Check shapes and what counts their entries.
+
+        Raises:
+            ConfigurationError: They cannot be those of an environment.
+        """
+        shapes = (self.observation_shape, self.goal_shape, self.state_shape, self.image_shape)
+        given = [shape for shape in shapes if shape is not None]
+        sizes = [self.action_dim, self.max_episode_steps, *(size for s in given for size in s)]
+        measured = self.state_shape or self.goal_shape
+        groups = self.task.groups if isinstance(self.task, DistanceTask) else ((0,),)
+        entries = [index for group in groups for index in group]
+        if not (
+            all(1 <= size <= LARGEST_SIZE for size in sizes)
+            and all(len(shape) in (1, 3) for shape in given)
+            and self.observation_dtype in ("float32", "uint8")
+            and all(groups)
+            and all(0 <= index < measured[0] for index in entries)
+            and all(0 <= index < self.observation_shape[0] for index in self.goal_coordinates)
+            and all(len(x) in (0, self.observation_shape[0]) for x in (self.center, self.spread))
+        ):
+            raise ConfigurationError(f"environment not understood: sizes of {self.name}")
 
 
 @runtime_checkable

@@ -40,6 +40,13 @@ def test_sweep_runs_everything_and_is_quick_the_second_time(
     assert [status.step for status in final] == [60, 60]
     assert {path.name: path.read_text() for path in out.glob("*.log")} == logs
     assert "point-u-sac-seed0" in _text(sweep.table(shown[-1]))
+    said: list[str] = []
+    lines = sweep.Lines(said.append)
+    for found in [*shown, shown[-1]]:
+        lines(found)
+    assert len(set(said)) == len(said)
+    assert said[-1].startswith("point-u-")
+    assert "finished" in said[-1]
 
 
 def test_a_run_that_fails_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,7 @@
 """Small goal environments of every kind that an environment of others may be."""
 
+import os
+import time
 from typing import Any
 
 import gymnasium
@@ -114,6 +116,28 @@ class Plane(gymnasium.Env[dict[str, Any], Any]):
 
     def render(self) -> Any:
         return np.full((8, 8, 3), self.steps, np.uint8)
+
+
+RAISES, HANGS, EXITS = (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)
+"""Actions that `Obedient` obeys."""
+
+
+class Obedient(Plane):
+    """The plane, which breaks where its action says so."""
+
+    def step(self, action: Any) -> Any:
+        match tuple(np.asarray(action).tolist()):
+            case (1.0, -1.0):
+                raise ValueError("the\nsimulator is tired")
+            case (-1.0, 1.0):
+                time.sleep(1_000)
+            case (1.0, 1.0):
+                os._exit(3)
+        return super().step(action)
+
+
+def obedient() -> Any:
+    return gymnasium.wrappers.TimeLimit(Obedient(), 20)
 
 
 class Seen(gymnasium.ObservationWrapper[Any, Any, Any]):

@@ -22,7 +22,7 @@ import midway
 from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, admit, describe, with_limit
 from midway.envs.goals_in_info import GoalsInInfo
 from midway.envs.sources import source
-from midway.errors import ConfigurationError, NonFiniteError
+from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
 from midway.training import seeds as midway_seeds
 
 TINY = {
@@ -282,7 +282,7 @@ def test_what_is_not_finite_stops_with_its_name() -> None:
     env.reset(seed=0)
     env.step(0 * RIGHT)
     env.step(0 * RIGHT)
-    with pytest.raises(NonFiniteError, match="observation of environment 0 is not finite"):
+    with pytest.raises(NonFiniteError, match=r"environment 0, in step 3 .* not finite"):
         env.step(0 * RIGHT)
 
 
@@ -378,6 +378,36 @@ def test_a_process_that_is_gone_is_told() -> None:
     with pytest.raises(RuntimeError, match="a process that steps environments has ended"):
         env.step(RIGHT)
     env.close()
+
+
+def test_what_breaks_in_another_process_is_named_and_made_anew() -> None:
+    env = ForeignVectorEnv(describe(fakes.obedient), 2, num_threads=2)
+    env.reset(seed=0)
+    env.step(0 * RIGHT)
+    with pytest.raises(BrokenEnvironmentError, match=named("ValueError: the\nsimulator")) as error:
+        env.step(np.array([[0, 0], fakes.RAISES], np.float32))
+    shown, _, _, truncated, info = error.value.step
+    assert info["broken"].tolist() == truncated.tolist() == [False, True]
+    assert np.isfinite(shown["observation"]).all()
+    env.reset(options={"reset_mask": info["broken"]})
+    env.step(0 * RIGHT)
+    for action, said in ((fakes.EXITS, "process .* has ended"), (fakes.HANGS, "no answer in 4 s")):
+        assert env._workers is not None
+        env._workers.limit = 4.0
+        with pytest.raises(BrokenEnvironmentError, match=named(said)) as error:
+            env.step(np.array([[0, 0], action], np.float32))
+        assert error.value.step is None
+        env._workers.limit = 600.0
+        env.reset()
+        env.step(0 * RIGHT)
+    env.close()
+
+
+def named(said: str) -> str:
+    """Return a pattern of copy, step, episode, action and reason."""
+    return (
+        rf"(?s)obedient: environment 1, in step \d of its episode \d, after action \[.*\]: .*{said}"
+    )
 
 
 @pytest.mark.parametrize("agent", ["ris", "sac"])

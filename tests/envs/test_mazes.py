@@ -5,7 +5,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from midway.envs.geodesic import distance_field, geodesic_distance
+from midway.envs.geodesic import distance_field, geodesic_distance, way_left
 from midway.envs.mazes import MAZES, Rectangle
 from midway.errors import ConfigurationError
 
@@ -203,3 +203,17 @@ def test_distance_field_is_the_distance_at_its_points(maze):
     assert geodesic_distance(maze, point, goal) == field.distance[row, column]
     free = maze.free(np.stack(np.meshgrid(field.x, field.y), axis=-1))
     np.testing.assert_array_equal(np.isfinite(field.distance), free)
+
+
+@pytest.mark.parametrize("maze", MAZES.values(), ids=lambda maze: maze.name)
+def test_the_way_left_bends_around_walls_and_is_known_wherever_a_robot_may_be(maze):
+    case = maze.cases["hard"]
+    start, goal = np.array([case.start.x, case.start.y]), np.array([case.goal.x, case.goal.y])
+    wall = maze.inner_walls[0]
+    pressed = np.array(
+        [[wall.low[0] - 0.21, wall.y], [wall.x, wall.high[1] + 0.21], [wall.x, wall.y]]
+    )
+    left = way_left(maze, np.concatenate([start[None], pressed]), goal)
+    assert left[0] > 1.3 * np.linalg.norm(goal - start)
+    assert np.isfinite(left).all()
+    assert (left[1:] >= np.linalg.norm(goal - pressed, axis=1) - 1e-9).all()

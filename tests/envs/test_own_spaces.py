@@ -1,19 +1,26 @@
 """What an environment itself observes, and how it takes actions."""
 
 import functools
+from pathlib import Path
 from typing import Any
 
 import fakes
 import gymnasium
+import jax
 import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import concatenate, create_empty_array
 
 import midway
+from midway.agents import registry
+from midway.configuration import configure
 from midway.envs import own_spaces
 from midway.envs.foreign import ForeignVectorEnv, describe
 from midway.errors import ConfigurationError
+from midway.runs import export
+from midway.runs.policy import Policy
+from midway.training.step import create_state
 
 FORMS: Any = {
     "numbers": fakes.limited,
@@ -56,10 +63,11 @@ def test_actions_are_in_the_environments_own_bounds_shape_and_type() -> None:
         return env
 
     actions = np.array([[-1.0, 0.5], [3.0, -3.0]], np.float32)
-    found = own_spaces.in_own_bounds(describe(wide), actions)
+    foreign = describe(wide)
+    found = own_spaces.in_own_bounds(foreign.spec, foreign, actions)
     np.testing.assert_allclose(found, [[[-2.0], [25.0]], [[0.0], [10.0]]])
     assert found.dtype == np.float64
-    np.testing.assert_array_equal(own_spaces.in_own_bounds(None, actions), actions)
+    np.testing.assert_array_equal(own_spaces.in_own_bounds(foreign.spec, None, actions), actions)
 
 
 @pytest.mark.parametrize("foreign", [True, False])
@@ -72,3 +80,23 @@ def test_observations_that_are_not_the_environments_are_refused(foreign: bool) -
         own_spaces.seen(spec, described, {k: shown[k] for k in ("observation", "desired_goal")})
     with pytest.raises(ConfigurationError, match=r"desired_goal of .* has shape"):
         own_spaces.seen(spec, described, shown | {"desired_goal": np.zeros((1, 1, 9))})
+
+
+def hidden() -> Any:
+    """Return an environment with bounds of its own, whose observations lack the goal."""
+    low, high = np.array([-2, 10], np.float32), np.array([0, 30], np.float32)
+    return gymnasium.wrappers.RescaleAction(fakes.Hidden(), low, high)
+
+
+def test_an_exported_policy_takes_and_gives_what_the_environment_does(tmp_path: Path) -> None:
+    foreign = describe(hidden)
+    config = configure(foreign, "sac", changes={"hidden": (8,)})
+    agent = registry.get("sac")
+    state = create_state(agent, config.hyperparameters, foreign.spec, jax.random.key(0))
+    policy = Policy(agent, state, config, foreign.spec)
+    act = export.write_numpy(policy, tmp_path / "policy.py")
+    assert export.check(policy, act) < 1e-5
+    observation, _ = hidden().reset(seed=0)
+    np.testing.assert_allclose(act(observation), policy.predict(observation), rtol=1e-5)
+    assert foreign.spec.observation_shape == (4,)
+    assert observation["observation"].shape == (2,)

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import threading
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -262,3 +263,22 @@ def test_rewards_of_images_are_refused_and_of_their_states_given():
         env.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})
     states = observation["desired_state"], observation["desired_state"]
     assert env.compute_terminated(*states, {})
+
+
+@needs_renderer
+@pytest.mark.parametrize("name", ["PointMaze-Pi", "PushState"])
+def test_registered_environments_draw_themselves(name):
+    env = gymnasium.make(f"midway/{name}-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.dtype == np.uint8
+    assert picture.std() > 10
+    for _ in range(4):
+        env.step(np.array([1.0, 0.0], np.float32))
+    assert (env.render() != picture).any()
+    assert gymnasium.make(f"midway/{name}-v0").unwrapped.render() is None
+
+
+def test_other_ways_to_draw_are_refused():
+    with pytest.raises(ConfigurationError, match="render_mode 'ansi'"):
+        SingleGoalEnv("point-u", render_mode="ansi")

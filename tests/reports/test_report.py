@@ -13,7 +13,7 @@ import pytest
 from midway.envs.mazes import MAZES
 from midway.envs.registry import entry
 from midway.envs.views import MazeView
-from midway.reports import cache, compose, images, maze, report
+from midway.reports import cache, compose, failures, images, maze, report
 from midway.reports.cache import Episode, Study, is_flipped
 from midway.reports.curves import success_curve
 from midway.reports.difficulty import bins
@@ -24,6 +24,7 @@ from midway.reports.runs import groups
 from midway.runs.folder import write_json
 
 FIGURES = {"learning-curves", "ris-map", "difficulty", "ris-subgoals", "ris-values", "health"}
+FIGURES |= {"ris-failures"}
 
 
 class Page(HTMLParser):
@@ -66,6 +67,26 @@ def test_one_run_gives_every_figure(single):
             assert "</svg>" in file.read_text()[-200:]
 
 
+def test_every_figure_says_what_to_conclude(single):
+    page = Page(single[0])
+    assert " ".join(page.words).count("What it says:") == len(page.images)
+
+
+def test_failures_are_shown_and_told_apart():
+    place, far = np.array([1.0, 1.0]), np.linspace((1.0, 1.0), (6.0, 6.0), 20)
+    maze, goal = MAZES["u"], np.array([1.4, 1.4])
+    common = {"task": "hard", "goal": goal, "success": False, "geodesic": 1.0}
+    episodes = [
+        Episode(path=np.stack([place] * 20), **common),
+        Episode(path=far, **common | {"task": "uniform"}),
+        Episode(path=far, flipped=True, **common),
+    ]
+    said = failures.conclusion(maze, episodes)
+    assert said.startswith("Of 3 failures, 1 lay on their backs; 1 ended less than 1 m before")
+    assert [episode.task for episode in failures.chosen(episodes)] == ["hard", "uniform", "hard"]
+    assert len(failures.draw(maze, episodes).axes) == 3
+
+
 def test_the_page_stands_alone(single):
     page = Page(single[0])
     assert len(page.images) == len(FIGURES)
@@ -88,7 +109,7 @@ def test_default_places(ris_run, copy_run, monkeypatch):
     asked = []
     monkeypatch.setattr(compose, "_write", lambda runs, out: asked.append(out) or [])
     run = copy_run(ris_run, "run")
-    report([run])
+    report(str(run))
     report([run, copy_run(ris_run, "other", seed=1)])
     assert asked == [run / "figures", run.parent / "report"]
 

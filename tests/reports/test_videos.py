@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 
 from midway import api
+from midway.envs.geodesic import way_left
 from midway.errors import ConfigurationError
 from midway.reports import videos, watch
-from midway.reports.recordings import chain, draws, record
+from midway.reports.recordings import Recording, chain, draws, record
+from midway.reports.scenes import Words
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio's reader
@@ -56,6 +58,20 @@ def test_a_place_that_cannot_be_written_is_one_line(ris_run, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigurationError, match="cannot write the video"):
         watch(ris_run, tmp_path / "file" / "a.mp4", "hard", 1, 0)
+
+
+def test_words_say_the_way_left_in_a_maze(ris_run):
+    policy = api.load(ris_run)
+    view = policy.config.declaration().view
+    case = view.maze.cases["hard"]
+    states = np.zeros((2, 4), np.float32)
+    states[0, :2], states[1, :2] = (case.start.x, case.start.y), (case.goal.x, case.goal.y)
+    episode = Recording("hard", states, states[1], states, states[1], False, 0.0)
+    words = Words(policy, episode, 1.0)
+    words.along(view, episode)
+    left = way_left(view.maze, states[:1, :2], states[1, :2])[0]
+    assert words.after(0) == f"step 0, {left:.1f} m of the way left"
+    assert words.after(1) == "step 1, 0.0 m of the way left"
 
 
 def test_recordings_are_whole_episodes(ris_run):

@@ -1,5 +1,6 @@
 """Environments of others that raise, or show what they did not declare, stop a run by name."""
 
+import csv
 import re
 from pathlib import Path
 from typing import Any
@@ -28,11 +29,12 @@ TINY: dict[str, object] = {
 
 
 class Line(gymnasium.Env[Any, Any]):
-    """A point on a line, which breaks once this many steps were taken by all of its kind."""
+    """A point on a line, which breaks between these steps of all of its kind."""
 
     breaks_after = 10**9
     how = "raise"
     taken = 0
+    until = 10**9
 
     def __init__(self) -> None:
         box = spaces.Box(-10, 10, (1,), np.float64)
@@ -49,7 +51,7 @@ class Line(gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> Any:
         Line.taken += 1
         self.x = np.clip(self.x + 0.2 * np.asarray(action, np.float64), -10, 10)
-        if Line.taken > Line.breaks_after:
+        if Line.breaks_after < Line.taken <= Line.until:
             if Line.how == "raise":
                 raise ValueError("the\nsimulator is tired")
             self.x = np.zeros(3) if Line.how == "shape" else np.array([np.nan])
@@ -81,3 +83,27 @@ def test_a_broken_environment_stops_the_run_by_name(
     assert "action [" in text
     assert "midway resume" in text
     assert max(steps_in(tmp_path / "run" / "checkpoints")) == 50
+
+
+@pytest.mark.parametrize("how", ["raise", "nan"])
+def test_a_broken_environment_is_made_anew_where_the_run_shall_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    env = midway.goal_env(Line, max_episode_steps=20, success_distance=0.2)
+    monkeypatch.setattr(Line, "how", how)
+    monkeypatch.setattr(Line, "breaks_after", Line.taken + 31)
+    monkeypatch.setattr(Line, "until", Line.taken + 33)
+    run = midway.train(env, agent="sac", out=tmp_path, changes=TINY, on_env_error="restart")
+    assert run.finished
+    with (tmp_path / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert sum(float(row["collect/restarts"]) for row in rows) == 2
+
+
+def test_an_environment_that_always_breaks_stops_the_run_after_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = midway.goal_env(Line, max_episode_steps=20, success_distance=0.2)
+    monkeypatch.setattr(Line, "breaks_after", Line.taken + 31)
+    with pytest.raises(BrokenEnvironmentError, match="simulator is tired"):
+        midway.train(env, agent="sac", out=tmp_path, changes=TINY, on_env_error="restart")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -232,19 +233,34 @@ def test_a_closed_pipe_of_standard_error_does_not_end_a_run(whole: Path, tmp_pat
 # --- environments ---------------------------------------------------------------------------------
 
 
+def at_step(monkeypatch: pytest.MonkeyPatch, step: int, act: Callable[[Any], None]) -> None:
+    """Do something with the environments once the run has taken this many steps."""
+    advance = loop.advance
+
+    def and_act(training: Training) -> None:
+        if training.counters.steps == step:
+            act(training.collector.env)
+        advance(training)
+
+    monkeypatch.setattr(loop, "advance", and_act)
+
+
 def test_a_number_that_is_not_finite_never_enters_the_replay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    advance = loop.advance
+    def show_nan(env: Any) -> None:
+        encode = env._encode
 
-    def diverging(training: Training) -> None:
-        env = training.collector.env
-        if training.counters.steps == 64:
-            env._qvel[2] = np.nan  # type: ignore[attr-defined]
-        advance(training)
+        def once(*state: Any) -> Any:
+            env._encode = encode
+            observation = encode(*state)
+            observation[2, 0] = np.nan
+            return observation
+
+        env._encode = once
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "advance", diverging)
+        at_step(patch, 64, show_nan)
         with pytest.raises(
             NonFiniteObservationError,
             match=r"point-u: environment 2 .* in step \d+ of its episode, after action \[.*step 68",
@@ -253,6 +269,27 @@ def test_a_number_that_is_not_finite_never_enters_the_replay(
     assert max(steps_in(tmp_path / "run" / "checkpoints")) == 68
     assert midway.resume(tmp_path / "run").finished
     assert all(np.isfinite(float(row["critic/loss"])) for row in rows(tmp_path / "run/metrics.csv"))
+
+
+def test_an_episode_whose_simulation_diverges_is_cut_and_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def throw(env: Any) -> None:
+        simulate = env._simulate
+
+        def once() -> None:
+            env._simulate = simulate
+            simulate()
+            env._qvel[2] = 1e300
+
+        env._simulate = once
+
+    at_step(monkeypatch, 64, throw)
+    assert train(tmp_path / "run").finished
+    found = rows(tmp_path / "run" / "metrics.csv")
+    assert {row["step"]: float(row["collect/diverged"]) for row in found}["80"] == 1
+    assert sum(float(row["collect/diverged"]) for row in found) == 1
+    assert all(np.isfinite(float(row["critic/loss"])) for row in found)
 
 
 def test_evaluation_of_an_environment_that_breaks_is_left_out(

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import midway
+from midway import files
 from midway.envs import registry
 from midway.envs.push import IMAGE_SPEC, STATE_SPEC
 from midway.errors import ConfigurationError
-from midway.runs.folder import RunFolder
+from midway.runs.folder import FORMAT, RunFolder
 from midway.types import EnvSpec, UnknownTask
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
@@ -50,6 +51,11 @@ def test_a_policy_loads_without_an_environment(
     drawn = policy.predict(shown, deterministic=False, seed=1)
     np.testing.assert_array_equal(drawn, policy.predict(shown, deterministic=False, seed=1))
     assert (drawn != policy.predict(shown, deterministic=False)).all()
+    description = json.loads((run.path / "policy.json").read_text())
+    later = files.sealed({**description, "format": FORMAT + 1})
+    (run.path / "policy.json").write_text(json.dumps(later))
+    with pytest.raises(ConfigurationError, match=f"format {FORMAT + 1}, expected 1 to {FORMAT}"):
+        midway.load(run.path)
 
 
 SPECS = [

@@ -38,6 +38,7 @@ class Settings:
     normalise: bool = setting(False, "none", "states by the environment's center and spread")
     goal_inputs: GoalInputs = setting("whole", "none", "of the networks", choices=GOAL_INPUTS)
     policy_every: int = setting(1, "table 1", "updates for each of the policy", least=1)
+    network: str = setting("", "none", "module:function that makes networks; nothing: an MLP")
     failure_cost: float = setting(1.0, "ours", "of a failed episode, times 1 / (1 - γ)", least=0)
 
 
@@ -69,6 +70,10 @@ class ActorCritic(EncoderConfig, Protocol):
     @property
     def goal_inputs(self) -> GoalInputs:
         """What networks read of a goal."""
+
+    @property
+    def network(self) -> str:
+        """What makes policies and critics (`midway.networks.custom`)."""
 
 
 @runtime_checkable
@@ -131,8 +136,12 @@ def actor_critic(
         inputs=read,
         layer_norm=config.layer_norm,
         count=config.num_critics,
+        custom=config.network,
     )
-    return encoder, critic, GaussianPolicy(pair, spec.action_dim, *layers, key=keys[2], inputs=read)
+    policy = GaussianPolicy(
+        pair, spec.action_dim, *layers, key=keys[2], inputs=read, custom=config.network
+    )
+    return encoder, critic, policy
 
 
 def pair_size(spec: EnvSpec, read: PairInputs) -> int:

@@ -269,7 +269,9 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     read = policy.inputs
     sizes = beyond.pair_size(spec, read), len(read.coordinates) or encoders.subgoal_size(spec)
     layers = (config.hidden, config.precision)
-    subgoal_policy = SubgoalPolicy(*sizes, *layers, key=subgoal_key, inputs=read)
+    subgoal_policy = SubgoalPolicy(
+        *sizes, *layers, key=subgoal_key, inputs=read, custom=config.network
+    )
     return State(
         encoder=encoder,
         critic=critic,

@@ -23,6 +23,7 @@ class About:
         success_function: MODULE:FUNCTION of achieved and desired goals that says so.
         max_episode_steps: Steps of an episode, in place of the registered limit.
         action_bound: Bounds of actions that have none.
+        step_seconds: Seconds after which a step of its copies in other processes counts as hanging.
         env_kwargs: Arguments of the environment, as JSON.
         imports: Modules that register environments.
         maze: File of a maze of your own, for the environments point and ant; or umaze, medium.
@@ -32,6 +33,7 @@ class About:
     success_function: str | None = None
     max_episode_steps: int | None = None
     action_bound: float | None = None
+    step_seconds: float = 600.0
     env_kwargs: str = "{}"
     imports: Annotated[tuple[str, ...], tyro.conf.arg(name="import")] = ()
     maze: str | None = None
@@ -60,7 +62,11 @@ class About:
         from midway.envs.foreign import Settings
 
         return Settings(
-            self.success_distance, self.success_function, self.max_episode_steps, self.action_bound
+            self.success_distance,
+            self.success_function,
+            self.max_episode_steps,
+            self.action_bound,
+            self.step_seconds,
         )
 
     def source(self) -> "JsonObject":

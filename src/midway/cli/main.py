@@ -1,7 +1,7 @@
 """The command line: wires and prints."""
 
 import dataclasses
-import json
+import importlib.metadata
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -13,8 +13,13 @@ from tyro.conf import Positional, arg
 
 from midway.cli.about import NOTHING, AboutEnv
 from midway.cli.compare import compare
-from midway.cli.parsing import Count, Kept, OptionalCount, parse, plain, run_folders, settings
+from midway.cli.lists import doctor, envs, presets, runs
+from midway.cli.measure import bench, check
+from midway.cli.parsing import Count, Kept, OptionalCount, parse, print_json, run_folders, settings
+from midway.cli.saved import export, pull, push
+from midway.cli.tuning import tune
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
+from midway.training import signals
 from midway.training.terminal import print_line
 
 if TYPE_CHECKING:
@@ -35,11 +40,17 @@ def train(
     num_envs: OptionalCount = None,
     out: Path | None = None,
     precision: Literal["f32", "bf16"] | None = None,
+    on_env_error: Literal["stop", "restart"] | None = None,
     data: str | None = None,
+    stop_at: float | None = None,
+    overwrite: bool = False,
+    wandb: str | None = None,
     set: tuple[str, ...] = (),
     about: AboutEnv = NOTHING,
 ) -> None:
     """Train an agent on an environment and write a run folder.
+
+    Every setting with its value and source: midway presets ENV AGENT --preset PRESET
 
     Args:
         env: Environment name (see `midway envs`), a Gymnasium id, module:Id or module:callable.
@@ -50,15 +61,25 @@ def train(
         num_envs: Parallel environments; default: the preset's.
         out: Run folder; default: runs/ENV-AGENT-seedN.
         precision: Matrix products in float32 or bfloat16; default: the preset's.
+        on_env_error: What a broken environment of others does: stop the run (default) or restart.
         data: Minari dataset (name or folder) that the replay begins with; with --set collect=False
             nothing else is learned from.
+        stop_at: Success of the task that is shown (hard, if there is one) that ends the run once
+            three evaluations in a row have reached it, such as 0.95.
+        overwrite: Delete the run that is in the folder, unless another process trains it.
+        wandb: Project of Weights & Biases that is shown the run too.
         set: Other settings of the preset, as NAME=VALUE.
         about: What midway must be told of an environment that is not its own.
     """
     from midway import api
+    from midway.envs import registry as environments
+    from midway.runs.folder import run_name
+    from midway.runs.tracking import watching
 
+    declared = environments.entry(about.env(env))
+    out = out or Path("runs") / run_name(declared.name, agent, seed)
     run = api.train(
-        about.env(env),
+        declared,
         agent=agent,
         preset=preset,
         steps=steps,
@@ -66,34 +87,15 @@ def train(
         num_envs=num_envs,
         out=out,
         precision=precision,
+        on_env_error=on_env_error,
         data=data,
         changes=settings(set),
         progress=True,
+        stop_at=stop_at,
+        callbacks=watching(wandb),
+        overwrite=overwrite,
     )
     _say_where(run)
-
-
-def check(
-    env: Positional[str],
-    num_envs: Count = 16,
-    seconds: float = 15.0,
-    about: AboutEnv = NOTHING,
-) -> None:
-    """Say what midway sees of a goal environment, and what is wrong with it.
-
-    Args:
-        env: Environment name, a Gymnasium id, module:Id or module:callable.
-        num_envs: Environments that are stepped together to measure.
-        seconds: How long random actions are taken, at most.
-        about: What midway must be told of an environment that is not its own.
-    """
-    from midway.envs import examine
-
-    findings = examine.examine(env, about.settings(), num_envs, seconds, **about.source())
-    for label, text, _ in findings:
-        print(f"{label:15} {text}")
-    if not all(ok for _, _, ok in findings):
-        sys.exit(EXIT_USAGE)
 
 
 def resume(
@@ -101,6 +103,9 @@ def resume(
     steps: OptionalCount = None,
     devices: OptionalCount = None,
     from_: Annotated[OptionalCount, arg(name="from")] = None,
+    stop_at: float | None = None,
+    wandb: str | None = None,
+    on_env_error: Literal["stop", "restart"] | None = None,
 ) -> None:
     """Continue a run from its newest checkpoint.
 
@@ -109,10 +114,24 @@ def resume(
         steps: New total of environment steps; default: the run's own.
         devices: New number of accelerators; default: the run's own.
         from_: Step of the checkpoint, 0 to start anew; later ones are renamed and kept.
+        stop_at: New success that ends the run; 0: none.
+        wandb: Project of Weights & Biases that is shown the run too.
+        on_env_error: What a broken environment of others does from now on: stop the run or restart.
     """
     from midway import api
+    from midway.runs.tracking import watching
 
-    _say_where(api.resume(run, steps=steps, devices=devices, progress=True, from_step=from_))
+    continued = api.resume(
+        run,
+        steps=steps,
+        devices=devices,
+        progress=True,
+        from_step=from_,
+        stop_at=stop_at,
+        on_env_error=on_env_error,
+        callbacks=watching(wandb),
+    )
+    _say_where(continued)
 
 
 def evaluate(
@@ -142,7 +161,7 @@ def evaluate(
     )
     if json:
         episodes_json = [dataclasses.asdict(episode) for episode in result.episodes]
-        _print_json(
+        print_json(
             {
                 "run": str(run),
                 "task": result.task,
@@ -208,8 +227,11 @@ def sweep(
     wanted = sweeps.jobs(envs, agents, seeds, options)
     for job in wanted:
         check_settings(job, out, preset, changes)
-    with Live(console=Console(stderr=True), refresh_per_second=1) as live:
-        final = sweeps.run(wanted, out, lambda found: live.update(sweeps.table(found)), ray)
+    if sys.stderr.isatty():
+        with Live(console=Console(stderr=True), refresh_per_second=1) as live:
+            final = sweeps.run(wanted, out, lambda found: live.update(sweeps.table(found)), ray)
+    else:
+        final = sweeps.run(wanted, out, sweeps.Lines(print_line), ray)
     if any(status.state in ("stopped", "waiting") for status in final):
         print_line(f"stopped; type the same command again to go on: {out}")
         sys.exit(EXIT_SIGNAL + signal.SIGINT)
@@ -265,126 +287,12 @@ def watch(
     print(reports.watch(run, out, task=task, episodes=episodes, seed=seed, policy=policy))
 
 
-def bench(
-    what: Positional[Literal["all", "update", "env", "replay", "loop", "memory", "plan"]] = "all",
-    env: str = "ant-u",
-    agent: str = "ris",
-    batch: Count = 256,
-    precision: Literal["f32", "bf16"] = "f32",
-    num_envs: Count = 64,
-    json: bool = False,
-) -> None:
-    """Measure how fast this machine updates, simulates, stores and plans, and what memory it takes.
-
-    Args:
-        what: One piece, or all of them.
-        env: Environment name.
-        agent: Agent name.
-        batch: Transitions of one update.
-        precision: Matrix products in float32 or bfloat16.
-        num_envs: Environments that are stepped together in env.
-        json: Print one JSON object.
-    """
-    from midway.bench import pieces as measure
-    from midway.bench import plan as bench_plan
-
-    pieces: dict[str, Callable[[], measure.Figures]] = {
-        "update": lambda: measure.update(env, agent, batch, precision),
-        "env": lambda: measure.environment(env, num_envs),
-        "replay": lambda: measure.replay(env, batch),
-        "loop": lambda: measure.whole_loop(env, agent, batch, precision),
-        "memory": lambda: measure.memory(env, agent, batch, precision),
-        "plan": lambda: bench_plan.plan(env, precision),
-    }
-    chosen = pieces if what == "all" else {what: pieces[what]}
-    of = {"env": env, "agent": agent, "batch": batch, "precision": precision, "num_envs": num_envs}
-    results = {name: piece() for name, piece in chosen.items()}
-    if json:
-        _print_json({"machine": measure.machine(), "settings": of, **results})
-        return
-    print(", ".join(f"{name} {value}" for name, value in {**measure.machine(), **of}.items()))
-    for name, figures in results.items():
-        print(f"{name:8}" + "  ".join(f"{key} {value:.4g}" for key, value in figures.items()))
-
-
-def envs(json: bool = False) -> None:
-    """List the environments and their tasks.
-
-    Args:
-        json: Print one JSON object.
-    """
-    from midway.envs.registry import ENVIRONMENTS
-
-    if json:
-        entries = {
-            name: {"id": e.gym_id, "tasks": list(e.tasks), "description": e.description}
-            for name, e in ENVIRONMENTS.items()
-        }
-        _print_json(entries)
-        return
-    for name, entry in ENVIRONMENTS.items():
-        print(f"{name:12} {entry.gym_id:26} {entry.description}")
-        print(f"{'':12} tasks: {', '.join(entry.tasks)}")
-
-
-def doctor(json: bool = False) -> None:
-    """Say what this machine has and what is missing.
-
-    Args:
-        json: Print one JSON object.
-    """
-    from midway.cli.doctor import checks
-
-    results = checks()
-    if json:
-        _print_json({check.name: dataclasses.asdict(check) for check in results})
-    else:
-        for check in results:
-            print(f"{'ok     ' if check.ok else 'MISSING'} {check.name:12} {check.detail}")
-    if not all(check.ok for check in results if check.needed):
-        sys.exit(EXIT_FAILED)
-
-
-def presets(
-    env: Positional[str] = "ant-u",
-    agent: Positional[str] = "ris",
-    preset: str = "quick",
-    set: tuple[str, ...] = (),
-    json: bool = False,
-) -> None:
-    """Print every setting of a preset with its value and where that comes from.
-
-    Args:
-        env: Environment name.
-        agent: Agent name.
-        preset: paper, quick, or a file ending in .toml.
-        set: Other settings of the preset, as NAME=VALUE.
-        json: Print one JSON object.
-    """
-    from midway import presets as rules
-    from midway import settings as declarations
-
-    resolved = rules.resolve(env, agent, preset, settings(set))
-    rows = [
-        (name, value, resolved.sources.get(name, rules.Source("default of the agent")), allowed)
-        for config in (resolved.train, resolved.hyperparameters)
-        for name, value, allowed in declarations.declared(config)
-    ]
-    if json:
-        _print_json(
-            {name: {"value": plain(value), **source._asdict()} for name, value, source, _ in rows}
-        )
-        return
-    for name, value, source, allowed in rows:
-        mark = f" [not the paper's: {source.deviates}]" if source.deviates else ""
-        print(f"{name:22} {plain(value)!s:22} {allowed.meaning:38} {source.source}{mark}".rstrip())
-
-
 COMMANDS: dict[str, Callable[..., None]] = {
     "check": check,
     "train": train,
     "resume": resume,
     "sweep": sweep,
+    "tune": tune,
     "evaluate": evaluate,
     "report": report,
     "compare": compare,
@@ -393,18 +301,35 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "envs": envs,
     "presets": presets,
     "doctor": doctor,
+    "runs": runs,
+    "export": export,
+    "push": push,
+    "pull": pull,
 }
+
+
+KEEPING = ("train", "resume", "sweep", "tune")
+"""Commands that end by a signal with a checkpoint; the others keep nothing."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command; exit with 0, 1 (failed while running), 2 (wrong use) or 128 + a signal."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    if list(arguments) == ["--version"]:
+        print(f"midway {importlib.metadata.version('midway')}")
+        return
     try:
         command = parse(COMMANDS, arguments)
         from midway.training.compilation import use_compilation_cache
 
         use_compilation_cache()
-        command()
+        if list(arguments)[:1] and arguments[0] in KEEPING:
+            command()
+            return
+        from midway.training.progress import showing_stages
+
+        with signals.ending_soon(), showing_stages():
+            command()
     except ConfigurationError as error:
         _fail(EXIT_USAGE, error)
     except (NonFiniteError, BrokenEnvironmentError) as error:
@@ -413,8 +338,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if "MUJOCO_GL" not in str(error):
             raise
         _fail(EXIT_USAGE, error)
-    except KeyboardInterrupt:
-        _fail(EXIT_SIGNAL + signal.SIGINT, "interrupted")
+    except KeyboardInterrupt as error:
+        _fail(EXIT_SIGNAL + getattr(error, "number", signal.SIGINT), "interrupted")
     except BrokenPipeError:
         sys.stdout = None
         sys.exit(EXIT_FAILED)
@@ -433,10 +358,6 @@ def _fail(status: int, error: object) -> None:
     text = " ".join(str(error).split())
     print_line(f"midway: {text}")
     sys.exit(status)
-
-
-def _print_json(value: object) -> None:
-    print(json.dumps(value))
 
 
 def _say_where(run: "Run") -> None:

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import io
+import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -99,6 +100,11 @@ def settings(words: Sequence[str]) -> dict[str, str]:
             raise ConfigurationError(f"--set {word!r}: write NAME=VALUE")
         changes[name.replace("-", "_")] = value
     return changes
+
+
+def print_json(value: object) -> None:
+    """Print one line of JSON."""
+    print(json.dumps(value))
 
 
 def run_folders(paths: Sequence[Path]) -> list[Path]:

@@ -4,7 +4,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -72,8 +72,12 @@ class Processes:
         self._running: set[subprocess.Popen[bytes]] = set()
         self.ending = threading.Event()
 
-    def run(self, command: Sequence[str], log: Path) -> int:
+    def run(
+        self, command: Sequence[str], log: Path, stop: Callable[[], bool] = lambda: False
+    ) -> int:
         """Run a command, what it says in a file; return its status.
+
+        Where ``stop`` is true, which is asked every second, it ends with a checkpoint.
 
         It is in a group of its own: a terminal's Ctrl-C reaches it through `end` alone, once.
         """
@@ -86,7 +90,7 @@ class Processes:
                     command, **streams, stderr=subprocess.STDOUT, process_group=0
                 )
                 self._running.add(process)
-            status = process.wait()
+            status = _wait(process, stop)
         with self._lock:
             self._running.discard(process)
         return status
@@ -105,8 +109,24 @@ class Processes:
                 process.kill()
 
 
+def _wait(process: subprocess.Popen[bytes], stop: Callable[[], bool]) -> int:
+    """Wait for a process, which is told once to end where ``stop`` is true."""
+    while process.poll() is None:
+        try:
+            return process.wait(POLL_SECONDS)
+        except subprocess.TimeoutExpired:
+            if stop():
+                process.terminate()
+                return process.wait()
+    return process.wait()
+
+
 def execute(
-    job: Job, folder: Path, core: int | None = None, processes: Processes | None = None
+    job: Job,
+    folder: Path,
+    core: int | None = None,
+    processes: Processes | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> State:
     """Run a job in a process of its own, on one core if given; return how it ended.
 
@@ -117,7 +137,7 @@ def execute(
     command = ["setpriv", "--pdeathsig", "KILL", *job.command(folder / job.name)]
     if core is not None:
         command = ["taskset", "-c", str(core), *command]
-    status = processes.run(command, folder / f"{job.name}.log")
+    status = processes.run(command, folder / f"{job.name}.log", stop)
     if status == 0 and finished(job, folder):
         return "finished"
     return "stopped" if processes.ending.is_set() else "failed"
@@ -135,9 +155,9 @@ def finished(job: Job, folder: Path) -> bool:
     run_folder = RunFolder(folder / job.name)
     try:
         steps = job.steps or run_folder.load_config().train.steps
+        return not complete.missing(run_folder, steps)
     except ConfigurationError:  # the run says what is wrong, if there is one
         return False
-    return not complete.missing(run_folder, steps)
 
 
 def check_settings(job: Job, folder: Path, preset: str, changes: Mapping[str, object]) -> None:
@@ -182,5 +202,5 @@ def last_success(evaluation: Path) -> tuple[int | None, Estimate | None]:
         row = np.flatnonzero(hard if hard.any() else last)[0]
         success = of_policy(table["success_rate"][row], table["episodes"][row])
         return int(table["step"][row]), success
-    except (ConfigurationError, KeyError, IndexError, ValueError):
+    except (ConfigurationError, KeyError, IndexError, ValueError, OverflowError):
         return None, None

@@ -88,7 +88,7 @@ def run(
     if ray_address is None:
         processes = Processes()
         workers = _local_workers(wanted, folder, states, processes)
-        with _ending(processes):
+        with ending(processes):
             _watch(workers, folder, states, show)
     else:
         _watch(on_ray.start(wanted, folder, states, ray_address), folder, states, show)
@@ -111,7 +111,7 @@ def _watch(
 
 
 @contextmanager
-def _ending(processes: Processes) -> Iterator[None]:
+def ending(processes: Processes) -> Iterator[None]:
     """Let the first signal end all runs with a checkpoint, and the second one at once.
 
     Raises:
@@ -166,6 +166,32 @@ def _local_workers(
 
     cores = sorted(os.sched_getaffinity(0))
     return [threading.Thread(target=work, args=(core,), daemon=True) for core in cores]
+
+
+class Lines:
+    """Says one line for each run whose state or last evaluation is another than before.
+
+    Args:
+        say: Is told each line.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._before: dict[Job, Status] = {}
+
+    def __call__(self, found: Sequence[Status]) -> None:
+        """Say what is new."""
+        for status in found:
+            if self._before.get(status.job) != status:
+                self._before[status.job] = status
+                self._say(_line(status))
+
+
+def _line(status: Status) -> str:
+    success = "" if status.success is None else f"success {status.success:.0%}"
+    step = "" if status.step is None else f"step {status.step}"
+    words = (status.job.name, status.state, step, success, status.reason)
+    return "  ".join(word for word in words if word)
 
 
 def table(found: Sequence[Status]) -> "Table":

@@ -6,8 +6,9 @@ reached by the rule that ``deciding.py`` finds.
 """
 
 import functools
+import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, TypeAlias
 
@@ -24,9 +25,14 @@ from midway.envs.simulation import num_cores
 from midway.envs.sources import Source, source
 from midway.envs.success import Rule, judge, reference_of
 from midway.envs.vector import Array, GoalVectorEnv
-from midway.envs.workers import Workers
-from midway.errors import ConfigurationError, NonFiniteObservationError
-from midway.types import DistanceTask, EnvSpec, Observations, Step, UnknownTask
+from midway.envs.workers import Answer, LostError, Workers
+from midway.errors import (
+    BrokenEnvironmentError,
+    ConfigurationError,
+    NonFiniteObservationError,
+)
+from midway.plain import check_kinds
+from midway.types import DistanceTask, EnvSpec, Info, Observations, Options, Step, UnknownTask
 
 CHEAP_SECONDS = 0.002
 """Environments whose steps take less time together are stepped without other processes."""
@@ -43,12 +49,15 @@ class Settings:
         success_function: ``module:function`` of achieved and desired goals that says so.
         max_episode_steps: Steps of an episode, in place of the registered limit.
         action_bound: Bounds of actions that have none.
+        step_seconds: Seconds that a step or a reset of all copies may take where other processes
+            step them: one that takes longer is taken for hanging.
     """
 
     success_distance: float | None = None
     success_function: str | Callable[..., Any] | None = None
     max_episode_steps: int | None = None
     action_bound: float | None = None
+    step_seconds: float = 600.0
 
 
 @dataclass(frozen=True)
@@ -120,7 +129,7 @@ class Foreign:
             ConfigurationError: It is none.
         """
         try:
-            return Foreign(
+            foreign = Foreign(
                 source=Source.from_json(stored["source"]),
                 spec=replace(
                     EnvSpec.from_json(stored["spec"]), task=success.from_json(stored["success"])
@@ -128,8 +137,11 @@ class Foreign:
                 settings=Settings(**stored["settings"]),
                 seconds=float(stored["seconds"]),
             )
-        except (KeyError, TypeError, AttributeError) as error:
+            for part in (foreign, foreign.source, foreign.spec.task, foreign.settings):
+                check_kinds(part)
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
             raise ConfigurationError(f"stored environment cannot be read: {error}") from error
+        return foreign
 
 
 def describe(
@@ -151,6 +163,8 @@ def describe(
             say when a goal is reached; the text says what to give.
     """
     settings = settings or Settings()
+    if not settings.step_seconds > 0:
+        raise ConfigurationError(f"step_seconds {settings.step_seconds}: must be positive")
     origin = source(env, kwargs, imports)
     name = origin.reference
     made = judge(origin)
@@ -228,6 +242,9 @@ class ForeignVectorEnv(GoalVectorEnv):
     ``failed``: where the environment ended its episode without success, for which ``step`` returns
     terminated too; ``is_success`` tells them apart. What cuts an episode short is truncated.
 
+    An environment that raises or shows what is not finite is replaced when it is reset. The error
+    that names it holds what the others show.
+
     Args:
         foreign: The environment.
         num_envs: Number of environments.
@@ -281,11 +298,32 @@ class ForeignVectorEnv(GoalVectorEnv):
         )
         count = self._num_processes(num_threads)
         self._group = make_group(first=0, size=num_envs) if count == 1 else None
-        self._workers = None if count == 1 else Workers(make_group, num_envs, count)
+        self._workers = (
+            None
+            if count == 1
+            else Workers(make_group, num_envs, count, foreign.settings.step_seconds)
+        )
         self._held: dict[str, Array] = {}
         self._newest: Observations = {}
         self._contradictions = 0
         self._resting = np.zeros(num_envs, np.bool_)
+        self._broken = np.zeros(num_envs, np.bool_)
+        self._fault: BrokenEnvironmentError | None = None
+        self._episodes = np.zeros(num_envs, np.int64)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Options | None = None
+    ) -> tuple[Observations, Info]:
+        """Start new episodes, as `GoalVectorEnv.reset`.
+
+        Raises:
+            BrokenEnvironmentError: As `step`; those that broke have no episode.
+        """
+        shown = super().reset(seed=seed, options=options)
+        self._ended |= self._broken
+        if self._fault is not None:
+            raise self._fault
+        return shown
 
     def rest(self, mask: Bool[Array, " num_envs"]) -> Observations:
         """Step these no more until they are reset: simulators of others can be slow.
@@ -302,7 +340,8 @@ class ForeignVectorEnv(GoalVectorEnv):
         Raises:
             ConfigurationError: The environment's info contradicts its rule of success.
             NonFiniteObservationError: What it observes is not finite.
-            BrokenEnvironmentError: It raises, or observes something else than its space.
+            BrokenEnvironmentError: It raises, hangs, ends its process, or observes something else
+                than its space.
         """
         observations, reward, _, truncated, info = super().step(actions)
         reached, ended = info["is_success"], self._held["terminated"] == 1
@@ -313,7 +352,14 @@ class ForeignVectorEnv(GoalVectorEnv):
         truncated, failed = truncated & awake, failed & awake
         terminated = (reached | failed) & awake
         self._ended = terminated | truncated
-        info |= {"failed": failed.copy(), "_failed": info["_is_success"].copy()}
+        everyone = info["_is_success"]
+        info |= {"failed": failed.copy(), "_failed": everyone.copy()}
+        if self._fault is not None:
+            truncated = truncated | self._broken
+            self._ended |= self._broken
+            info |= {"broken": self._broken.copy(), "_broken": everyone.copy()}
+            self._fault.step = (observations, reward, terminated, truncated, info)
+            raise self._fault
         return observations, reward, terminated, truncated, info
 
     def success_pair(self, observations: Mapping[str, Array]) -> tuple[Array, Array]:
@@ -339,40 +385,73 @@ class ForeignVectorEnv(GoalVectorEnv):
         for copy in copies:
             mask[copy], seeds[copy] = True, self.generators[copy].integers(2**31)
         self._resting &= ~mask
-        if self._workers is not None:
-            self._hold(self._workers.reset(mask, seeds))
-        elif self._group is not None:
-            self._hold(self._group.reset(options={"mask": mask, "seeds": seeds})[0])
+        self._episodes[copies] += 1
+        self._ask(lambda workers: workers.reset(mask, seeds), {"mask": mask, "seeds": seeds}, None)
 
     def _advance(self, actions: Shaped[Array, "num_envs action_dim"]) -> None:
         actions = np.where(self._resting[:, None], np.nan, actions).astype(np.float32)
-        if self._workers is not None:
-            self._hold(self._workers.step(actions), actions)
-        elif self._group is not None:
-            self._hold(self._group.step(actions)[0], actions)
+        self._ask(lambda workers: workers.step(actions), None, actions)
 
-    def _moment(self, copy: int, actions: Array | None) -> str:
-        """Say when in its episode an environment was asked for what it shows."""
-        if actions is None:
-            return "after its reset"
-        step = int(self._elapsed[copy]) + 1
-        return f"in step {step} of its episode, after action {actions[copy].tolist()}"
-
-    def _hold(self, shown: Mapping[str, Array], actions: Array | None = None) -> None:
-        """Keep what the environments show, apart from the memory that they share.
+    def _ask(
+        self,
+        ask: Callable[[Workers], Answer],
+        options: dict[str, Any] | None,
+        actions: Array | None,
+    ) -> None:
+        """Reset by options, or step by actions, and keep what the environments show.
 
         Raises:
-            NonFiniteObservationError: Something is not finite.
+            BrokenEnvironmentError: A process does not answer, or has ended.
         """
-        self._held = {name: batch.copy() for name, batch in shown.items()}
+        if self._workers is not None:
+            try:
+                shown, raised = ask(self._workers)
+            except LostError as lost:
+                self._ended[:] = True
+                raise self._named(lost.copies[0], actions, str(lost)) from lost
+        else:
+            assert self._group is not None
+            answer = (
+                self._group.reset(options=options) if actions is None else self._group.step(actions)
+            )
+            said = json.loads(answer[-1].get("raised", "{}"))
+            shown, raised = answer[0], {int(copy): text for copy, text in said.items()}
+        self._hold(shown, raised, actions)
+
+    def _named(self, copy: int, actions: Array | None, what: str) -> BrokenEnvironmentError:
+        """Return an error that says which environment broke, and when."""
+        episode = self._episodes[copy]
+        when = f"in the reset of its episode {episode}"
+        if actions is not None:
+            step, action = int(self._elapsed[copy]) + 1, actions[copy].tolist()
+            when = f"in step {step} of its episode {episode}, after action {action}"
+        return BrokenEnvironmentError(f"{self.goal_spec.name}: environment {copy}, {when}: {what}")
+
+    def _hold(
+        self, shown: Mapping[str, Array], raised: Mapping[int, str], actions: Array | None
+    ) -> None:
+        """Keep what the environments show, apart from the memory that they share.
+
+        Those that broke show what they last showed.
+        """
+        before, self._held = self._held, {name: batch.copy() for name, batch in shown.items()}
+        self._broken = self._held["broken"] == 1
+        self._fault = None
+        for copy, text in raised.items():
+            self._fault = self._fault or self._named(copy, actions, text)
         for name in self.single_observation_space:
             batch = self._held[name]
-            if batch.dtype != np.uint8 and not np.isfinite(batch).all():
-                copy = int(np.flatnonzero(~np.isfinite(batch.reshape(self.num_envs, -1)).all(1))[0])
-                raise NonFiniteObservationError(
-                    f"{self.goal_spec.name}: {name} of environment {copy} is not finite "
-                    f"{self._moment(copy, actions)}"
+            if batch.dtype == np.uint8:
+                continue
+            sound = np.isfinite(batch.reshape(self.num_envs, -1)).all(1)
+            if not sound.all() and self._fault is None:
+                named = self._named(
+                    int(np.flatnonzero(~sound)[0]), actions, f"{name} is not finite"
                 )
+                self._fault = NonFiniteObservationError(str(named))
+            self._broken |= ~sound
+        for name, batch in self._held.items():
+            batch[self._broken] = before[name][self._broken] if before else 0
 
     def _observe(self) -> Observations:
         boxes: Any = self.single_observation_space

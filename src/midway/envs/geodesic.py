@@ -12,6 +12,10 @@ CLEARANCE = 1e-6
 """Distance of path corners from grown walls (m), so that paths along a wall do not touch it."""
 
 
+NARROW = 0.2
+"""Distance from walls (m) that no robot in a maze falls below, as it is pressed against one."""
+
+
 class DistanceField(NamedTuple):
     """Distances to one goal on a grid of points."""
 
@@ -43,6 +47,18 @@ def geodesic_distance(
     if not maze.free(goal, radius):
         distance[:] = np.inf
     return np.asarray(distance.reshape(start.shape[:-1]))
+
+
+def way_left(
+    maze: Maze, points: Float[np.ndarray, "T 2"], goal: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, " T"]:
+    """Return how far the goal is from each place of an episode, along the corridors (m).
+
+    Unlike `geodesic_distance` this is finite wherever a robot may be, close to walls too.
+    """
+    straight = np.linalg.norm(points - goal, axis=-1)
+    along = geodesic_distance(maze, points, goal, NARROW)
+    return np.where(np.isfinite(along), along, straight)
 
 
 def distance_field(

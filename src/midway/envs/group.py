@@ -1,6 +1,7 @@
 """Several environments that are not midway's, stepped one after the other by one process."""
 
 import contextlib
+import json
 import os
 import signal
 from collections.abc import Iterator, Mapping
@@ -12,10 +13,10 @@ from gymnasium import spaces
 
 from midway.envs.reading import Array, Reading, readings, word_of
 from midway.envs.sources import Source, printing_to_stderr
-from midway.errors import BrokenEnvironmentError
 
-FLAGS = ("terminated", "truncated", "word")
-"""What each environment said of its last step; ``word``: of success, -1 where it said nothing."""
+FLAGS = ("terminated", "truncated", "word", "broken")
+"""What each environment said of its last step; ``word``: of success, -1 where it said nothing;
+``broken``: it raised, and another takes its place when it is reset."""
 
 
 class Group(gymnasium.Env[dict[str, Array], Array]):
@@ -23,7 +24,8 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
 
     One process steps a group. Everything travels in the observation, and so through the memory
     that ``AsyncVectorEnv`` shares. ``reset`` takes ``options``: ``mask`` and ``seeds`` of every
-    environment of all groups; the environments themselves are made when they are first reset.
+    environment of all groups; the environments themselves are made when they are first reset. What
+    they raise is told in info: ``raised``, a JSON object of texts by their numbers.
 
     Args:
         source: What makes the environments.
@@ -34,6 +36,7 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
         max_episode_steps: Limit in place of the registered one.
         action_bound: Bounds of actions that have none.
         render_mode: Gymnasium's.
+        busy: File of a byte for each environment of all groups, which is 1 while it is asked.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -48,6 +51,7 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
         max_episode_steps: int | None = None,
         action_bound: float | None = None,
         render_mode: str | None = None,
+        busy: str | None = None,
     ) -> None:
         self.source, self.render_mode = source, render_mode
         self.places = range(first, min(first + size, total))
@@ -61,8 +65,11 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
         shown = spaces.Dict(boxes | flags)
         self.observation_space: spaces.Space[Any] = shown
         self.action_space = spaces.Box(-1, 1, (size, self.low.size), np.float32)
-        self.envs: list[Any] = []
-        self.lengths = [0 for _ in self.places]
+        self.envs: list[Any] = [None for _ in self.places]
+        self.busy = np.zeros(total, np.uint8)
+        if busy is not None:
+            self.busy = np.memmap(busy, np.uint8, "r+", shape=(total,))
+        self.raised: dict[int, str] = {}
         self.held: dict[str, Array] = {
             name: np.zeros(box.shape or (), box.dtype) for name, box in shown.items()
         }
@@ -72,40 +79,37 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
     ) -> tuple[dict[str, Array], dict[str, Any]]:
         """Start new episodes in the environments of the mask."""
         mask, seeds = (options or {})["mask"], (options or {})["seeds"]
-        if not self.envs:
-            make = self.source.make
-            self.envs = [make(self.limit, self.render_mode) for _ in self.places]
         for place, index in enumerate(self.places):
             if mask[index]:
-                self.lengths[place] = 0
-                with self._naming(place, None), printing_to_stderr():
+                if self.envs[place] is None:
+                    self.envs[place] = self.source.make(self.limit, self.render_mode)
+                with self._noting(place), printing_to_stderr():
                     observation, info = self.envs[place].reset(seed=int(seeds[index]))
                     self._hold(place, observation, info, False, False)
-        return self.held, {}
+        return self.held, self._take_raised()
 
     def step(self, actions: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
         """Move every environment by one step, by actions in [-1, 1]; NaN: it rests."""
         wanted = scaled(actions, self.low, self.high)
         for place, env in enumerate(self.envs):
-            if np.isnan(wanted[place]).any():
-                self._flag(place, False, False, -1)
+            if env is None or np.isnan(wanted[place]).any():
+                self._flag(place, False, False, -1, False)
                 continue
             action = wanted[place].reshape(env.action_space.shape).astype(env.action_space.dtype)
-            self.lengths[place] += 1
-            with self._naming(place, action):
+            with self._noting(place):
                 observation, _, terminated, truncated, info = env.step(action)
                 self._hold(place, observation, info, terminated, truncated)
-        return self.held, 0.0, False, False, {}
+        return self.held, 0.0, False, False, self._take_raised()
 
     def render(self) -> list[Any]:  # type: ignore[override]
         """Return a picture of each environment."""
-        return [env.render() for env in self.envs]
+        return [env.render() for env in filter(None, self.envs)]
 
     def close(self) -> None:
         """Close every environment."""
-        for env in self.envs:
+        for env in filter(None, self.envs):
             env.close()
-        self.envs = []
+        self.envs = [None for _ in self.places]
 
     def work_alone(self) -> None:
         """Leave signals to the process that trains, which ends this one when it is done."""
@@ -114,29 +118,31 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
         os.dup2(2, 1)
 
     @contextlib.contextmanager
-    def _naming(self, place: int, action: Array | None) -> Iterator[None]:
-        """Say which environment raised, and when.
-
-        Raises:
-            BrokenEnvironmentError: It did, or observes something else than its space.
-        """
+    def _noting(self, place: int) -> Iterator[None]:
+        """Note that an environment is asked, and what it raises; it is not asked again then."""
+        copy = self.places[place]
+        self.busy[copy] = True
         try:
             yield
         except Exception as error:  # whatever the code of others raises
-            when = "in its reset"
-            if action is not None:
-                when = f"in step {self.lengths[place]} of its episode, action {action.tolist()}"
-            raise BrokenEnvironmentError(
-                f"{self.source.reference}: environment {self.places[place]}, {when}: "
-                f"{type(error).__name__}: {error}"
-            ) from error
+            self.raised[copy] = f"{type(error).__name__}: {error}"
+            broken, self.envs[place] = self.envs[place], None
+            with contextlib.suppress(Exception):
+                broken.close()
+            self._flag(place, False, False, -1, True)
+        finally:
+            self.busy[copy] = False
+
+    def _take_raised(self) -> dict[str, Any]:
+        raised, self.raised = self.raised, {}
+        return {"raised": json.dumps(raised)} if raised else {}
 
     def _hold(
         self, place: int, observation: Mapping[str, Any], info: Mapping[str, Any], *ends: bool
     ) -> None:
         for name, reading in self.readings.items():
             self.held[name][place] = reading.read(observation[name])
-        self._flag(place, *ends, word_of(info)[1])
+        self._flag(place, *ends, word_of(info)[1], False)
 
     def _flag(self, place: int, *flags: int) -> None:
         for name, value in zip(FLAGS, flags, strict=True):
@@ -153,4 +159,4 @@ def action_bounds(space: spaces.Box, bound: float | None) -> tuple[Array, Array]
 
 def scaled(actions: Array, low: Array, high: Array) -> Array:
     """Return actions in [-1, 1] ``(..., A)`` between these bounds; beyond is the nearest bound."""
-    return low + (np.clip(actions, -1, 1) + 1) / 2 * (high - low)
+    return np.asarray(low + (np.clip(actions, -1, 1) + 1) / 2 * (high - low))

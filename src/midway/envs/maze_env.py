@@ -6,9 +6,10 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32, Int, UInt8
 
 from midway.envs.mazes import WALL_HEIGHT, Maze
+from midway.envs.rendering import Renderer, camera_above
 from midway.envs.simulation import SimulationVectorEnv
 from midway.envs.vector import Array
 from midway.errors import ConfigurationError
@@ -20,6 +21,15 @@ GOAL_THRESHOLD = 0.5
 ROUNDING = 1e-5
 """More than float32 rounding can take from a distance in a maze (m)."""
 
+
+PICTURE_SIDE = 480
+"""Rows and columns of a picture."""
+
+RIM = 2.0
+"""What a picture shows around the arena, the outer walls (m)."""
+
+WALL, FLOOR, ROBOT = (0.35, 0.37, 0.4, 1.0), (0.8, 0.8, 0.78, 1.0), (0.85, 0.4, 0.1, 1.0)
+"""Colours in pictures."""
 
 LARGEST_IN_SPREADS = 3.0
 """How many deviations from the middle the far wall lies, at most."""
@@ -66,6 +76,8 @@ class MazeVectorEnv(SimulationVectorEnv):
         num_threads: int = 0,
     ) -> None:
         self.maze = maze
+        self._model = model
+        self._renderer: Renderer | None = None
         goal_spec = EnvSpec(
             name=name,
             observation_shape=observation_box.shape,
@@ -102,6 +114,20 @@ class MazeVectorEnv(SimulationVectorEnv):
         self, qpos: Float[Array, "n num_positions"], qvel: Float[Array, "n num_velocities"]
     ) -> Float32[Array, "n observation_dim"]:
         """Return the observations of these states."""
+
+    def render(self) -> tuple[UInt8[Array, "h w 3"], ...]:
+        """Return a picture of each copy from above, with a disc at its goal.
+
+        Raises:
+            ConfigurationError: Nothing here can draw.
+        """
+        if self._renderer is None:
+            arena = self.maze.arena
+            _paint(self._model)
+            half = max(arena.half_x, arena.half_y) + RIM
+            self._renderer = Renderer(self._model, camera_above(arena.x, arena.y, half))
+        goals = self._goals["desired_goal"][:, :2].astype(np.float64)
+        return tuple(self._renderer.draw(self._qpos, goals))
 
     def _achieved(self) -> Observations:
         observation = self._encode(self._qpos, self._qvel)
@@ -140,6 +166,18 @@ class MazeVectorEnv(SimulationVectorEnv):
                 f"{role} {points.tolist()}: must be in the maze and {self.body_radius} m from walls"
             )
         return list(points)
+
+
+def _paint(model: mujoco.MjModel) -> None:
+    """Set size, light and colours of pictures; the physics knows nothing of them."""
+    model.vis.global_.offwidth = model.vis.global_.offheight = PICTURE_SIDE
+    model.vis.headlight.ambient[:] = 0.6
+    for number in range(model.ngeom):
+        geom = model.geom(number)
+        is_wall = geom.name.startswith(("inner-", "outer-"))
+        is_floor = geom.type == mujoco.mjtGeom.mjGEOM_PLANE.value
+        model.geom_matid[number] = -1
+        model.geom_rgba[number] = WALL if is_wall else FLOOR if is_floor else ROBOT
 
 
 def _spread(spread: tuple[float, ...], maze: Maze) -> tuple[float, ...]:

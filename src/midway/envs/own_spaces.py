@@ -59,18 +59,33 @@ def seen(spec: EnvSpec, foreign: Foreign | None, observation: Mapping[str, Any])
         return batch if read[key].is_image else batch.astype(np.float32)
 
     states, goals = rows("observation"), rows("desired_goal")
-    if states.shape[1:] != spec.observation_shape:
+    if appends_goal(spec, foreign):
         states = np.concatenate([states, rows("achieved_goal")], axis=1)
     return Seen(states, goals, single)
 
 
-def in_own_bounds(foreign: Foreign | None, actions: Float[Array, "B A"]) -> Array:
+def in_own_bounds(spec: EnvSpec, foreign: Foreign | None, actions: Float[Array, "B A"]) -> Array:
     """Return actions in [-1, 1] as the environment itself takes them ``(B, ...)``."""
     if foreign is None:
         return actions
+    space, (low, high) = judge(foreign.source).action_space, bounds(spec, foreign)
+    return scaled(actions, low, high).reshape(-1, *space.shape).astype(space.dtype)
+
+
+def bounds(spec: EnvSpec, foreign: Foreign | None) -> tuple[Array, Array]:
+    """Return the lower and upper bounds of the environment's own actions, flat ``(A,)``."""
+    if foreign is None:
+        return -np.ones(spec.action_dim), np.ones(spec.action_dim)
     space = judge(foreign.source).action_space
-    bounds = action_bounds(space, foreign.settings.action_bound)
-    return scaled(actions, *bounds).reshape(-1, *space.shape).astype(space.dtype)
+    return action_bounds(space, foreign.settings.action_bound)
+
+
+def appends_goal(spec: EnvSpec, foreign: Foreign | None) -> bool:
+    """Return whether agents see the achieved goal behind an observation that lacks it."""
+    if foreign is None:
+        return False
+    read = readings(spec.name, judge(foreign.source).observation_space)
+    return read["observation"].shape != spec.observation_shape
 
 
 def _own(spec: EnvSpec, observation: Mapping[str, Any]) -> Seen:

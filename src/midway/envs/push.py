@@ -120,6 +120,14 @@ class PushStateVectorEnv(SimulationVectorEnv):
             pose[self._arm.addresses] = self._arm.angles(state[:2])
         return poses
 
+    def render(self) -> tuple[Shaped[Array, "84 84 3"], ...]:
+        """Return a picture of each copy, as `push` observes it.
+
+        Raises:
+            ConfigurationError: Nothing here can draw.
+        """
+        return tuple(draw(self.model, self._qpos))
+
     def _states(self) -> Float32[Array, "num_envs 4"]:
         return np.concatenate([self._hands, self._qpos[:, self._puck]], axis=1, dtype=np.float32)
 
@@ -131,8 +139,7 @@ class PushStateVectorEnv(SimulationVectorEnv):
         moved = self._targets + ACTION_SCALE * np.clip(actions, -1, 1)
         self._targets[:] = np.clip(moved, HAND_BOX.low, HAND_BOX.high)
 
-    def _advance(self, actions: Shaped[Array, "num_envs 2"]) -> None:
-        self._apply(actions)
+    def _simulate(self) -> None:
         # The stage makes the positions of bodies those of the new state.
         self.batch.step(nstep=self.substeps, stage=POSITIONS)
 

@@ -29,6 +29,14 @@ PACKAGES = "libegl1 libgl1-mesa-dri (or libosmesa6)"
 MAX_GEOMS = 100
 """Most shapes in a picture."""
 
+FIELD_OF_VIEW = 45.0
+"""Angle that a free camera sees, MuJoCo's default (degrees)."""
+
+DISC_SIZE = np.array([0.5, 0.05, 0.0])
+"""Radius and half height of the disc at a goal (m): what counts as reached in mazes."""
+
+DISC_COLOUR = np.array([0.1, 0.7, 0.3, 0.6], np.float32)
+
 UNUSED_EFFECTS = (
     mujoco.mjtRndFlag.mjRND_SHADOW,
     mujoco.mjtRndFlag.mjRND_REFLECTION,
@@ -74,13 +82,14 @@ class Renderer:
     """Draws one model in the thread that made it, without shadows, reflections or sky.
 
     Args:
-        model: A model with a camera.
+        model: A model, which says how large the pictures are.
+        camera: What looks at it; default: its first camera.
 
     Raises:
         ConfigurationError: No backend works here.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, camera: mujoco.MjvCamera | None = None) -> None:
         width, height = model.vis.global_.offwidth, model.vis.global_.offheight
         self._model = model
         self._data = mujoco.MjData(model)
@@ -88,26 +97,28 @@ class Renderer:
         for effect in UNUSED_EFFECTS:
             self._scene.flags[effect] = 0
         self._options = mujoco.MjvOption()
-        self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
-        self._camera.fixedcamid = 0
+        self._camera = camera or _first_camera()
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         self._picture = np.empty((height, width, 3), np.uint8)
         self._gl = _working_backend()[1](width, height)
         self._gl.make_current()
         self._context = _drawing_context(model)
 
-    def draw(self, qpos: Float[np.ndarray, "n nq"]) -> UInt8[np.ndarray, "n h w 3"]:
-        """Return a picture of each state, row 0 at the top."""
+    def draw(
+        self, qpos: Float[np.ndarray, "n nq"], goals: Float[np.ndarray, "n 2"] | None = None
+    ) -> UInt8[np.ndarray, "n h w 3"]:
+        """Return a picture of each state, row 0 at the top, with a disc at each goal (m)."""
         pictures = np.empty((len(qpos), *self._picture.shape), np.uint8)
         # Something else may have made its own context the thread's current one.
         with self._gl.as_current():
-            for picture, positions in zip(pictures, qpos, strict=True):
-                self._draw_one(positions)
-                picture[:] = self._picture[::-1]
+            for number, positions in enumerate(qpos):
+                self._draw_one(positions, None if goals is None else goals[number])
+                pictures[number] = self._picture[::-1]
         return pictures
 
-    def _draw_one(self, positions: Float[np.ndarray, " nq"]) -> None:
+    def _draw_one(
+        self, positions: Float[np.ndarray, " nq"], goal: Float[np.ndarray, "2"] | None
+    ) -> None:
         self._data.qpos[:] = positions
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
@@ -120,8 +131,33 @@ class Renderer:
             mujoco.mjtCatBit.mjCAT_ALL.value,
             self._scene,
         )
+        if goal is not None:
+            self._add_disc(goal)
         mujoco.mjr_render(self._viewport, self._scene, self._context)
         mujoco.mjr_readPixels(self._picture, None, self._viewport, self._context)
+
+    def _add_disc(self, place: Float[np.ndarray, "2"]) -> None:
+        disc = self._scene.geoms[self._scene.ngeom]
+        kind, position = mujoco.mjtGeom.mjGEOM_CYLINDER.value, np.array([*place, 0.05])
+        mujoco.mjv_initGeom(disc, kind, DISC_SIZE, position, np.eye(3).ravel(), DISC_COLOUR)
+        self._scene.ngeom += 1
+
+
+def camera_above(x: float, y: float, half: float) -> mujoco.MjvCamera:
+    """Return a camera that looks straight down, on a square of twice this side (m)."""
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE.value
+    camera.lookat[:] = x, y, 0
+    camera.azimuth, camera.elevation = 90, -90
+    camera.distance = half / np.tan(np.deg2rad(FIELD_OF_VIEW / 2))
+    return camera
+
+
+def _first_camera() -> mujoco.MjvCamera:
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
+    camera.fixedcamid = 0
+    return camera
 
 
 def _drawing_context(model: mujoco.MjModel) -> mujoco.MjrContext:

@@ -10,7 +10,7 @@ from jaxtyping import Int, Shaped
 from mujoco.batch import Batch
 
 from midway.envs.vector import Array, GoalVectorEnv
-from midway.types import EnvSpec, Observations, Options
+from midway.types import EnvSpec, Observations, Options, Step
 
 
 def num_cores() -> int:
@@ -24,6 +24,9 @@ class SimulationVectorEnv(GoalVectorEnv):
     A subclass implements ``_place`` (new starts and goals, written to the batch and ``_goals``)
     and ``_achieved`` (what is observed, from the batch), and ``_apply`` where actions are
     not the model's controls.
+
+    A copy whose simulation diverges stays in the state before the step, and its episode is
+    truncated; info ``diverged`` tells.
 
     Args:
         model: The MuJoCo model of one copy.
@@ -69,6 +72,7 @@ class SimulationVectorEnv(GoalVectorEnv):
         self._qpos = self.batch.bind("qpos")
         self._qvel = self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
+        self._diverged = np.zeros(num_envs, np.bool_)
         self._goals: Observations = {
             name: np.zeros((num_envs, *box.shape), box.dtype)  # type: ignore[arg-type]
             for name, box in self.single_observation_space.items()
@@ -91,9 +95,26 @@ class SimulationVectorEnv(GoalVectorEnv):
         self.batch.reset(copies, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         self._place(copies, options)
 
-    def _advance(self, actions: Shaped[Array, "num_envs action_dim"]) -> None:
-        self._apply(actions)
+    def _simulate(self) -> None:
+        """Take one step of the environment in all simulations."""
         self.batch.step(nstep=self.substeps)
+
+    def _advance(self, actions: Shaped[Array, "num_envs action_dim"]) -> None:
+        before = self.batch.state.copy()
+        self._apply(actions)
+        self._simulate()
+        moving = np.concatenate([self._qpos, self._qvel], axis=1)
+        self._diverged = ~(np.abs(moving) < mujoco.mjMAXVAL).all(1)  # NaN is not below either
+        if self._diverged.any():
+            self.batch.state[self._diverged] = before[self._diverged]
+
+    def step(self, actions: Array) -> Step:
+        """Move every copy by one step, as `GoalVectorEnv.step`."""
+        observations, reward, terminated, truncated, info = super().step(actions)
+        truncated = truncated | self._diverged
+        self._ended |= self._diverged
+        info |= {"diverged": self._diverged.copy(), "_diverged": info["_is_success"].copy()}
+        return observations, reward, terminated, truncated, info
 
     def _observe(self) -> Observations:
         return self._achieved() | {name: goal.copy() for name, goal in self._goals.items()}

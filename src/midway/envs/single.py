@@ -18,19 +18,22 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
     """A goal environment of the registry, as a batch of one.
 
     Observations are dictionaries with ``observation``, ``achieved_goal`` and ``desired_goal``.
-    There is nothing to render: figures are drawn from the states.
 
     Args:
         name: A name of the registry, such as ``point-u``.
         task: A task of the environment.
+        render_mode: ``rgb_array``, or None for no pictures; ``midway watch --live`` has a window.
 
     Raises:
-        ConfigurationError: An unknown name or task.
+        ConfigurationError: An unknown name, task or render mode.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
-    def __init__(self, name: str, task: str = "uniform") -> None:
+    def __init__(self, name: str, task: str = "uniform", render_mode: str | None = None) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ConfigurationError(f"render_mode {render_mode!r}: must be rgb_array or None")
+        self.render_mode = render_mode
         self.vector = make_vec(name, num_envs=1, task=task, num_threads=1)
         self.goal_spec = self.vector.goal_spec
         self.observation_space: gymnasium.Space[Any] = self.vector.single_observation_space
@@ -70,6 +73,15 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
             bool(truncated[0]),
             _first_info(info),
         )
+
+    def render(self) -> Array | None:  # type: ignore[override]
+        """Return a picture ``(rows, columns, 3)`` uint8; None without a render mode.
+
+        Raises:
+            ConfigurationError: Nothing here can draw.
+        """
+        pictures = self.vector.render() if self.render_mode else None
+        return np.asarray(pictures[0]) if pictures else None
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: object) -> ArrayLike:
         """Return the reward of goals ``(goal_dim,)`` or ``(n, goal_dim)``; info is not used.

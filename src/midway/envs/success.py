@@ -224,7 +224,7 @@ def from_json(stored: Mapping[str, Any]) -> Rule:
             return AskedRule(source=source, goal_shape=tuple(shape), **values)
         if stored["rule"] == "function":
             return FunctionRule(**values)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise ConfigurationError(f"success rule {json.dumps(dict(stored))}: {error}") from error
     raise ConfigurationError(
         f"success rule {stored['rule']!r}: must be distance, asked or function"

@@ -5,8 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from midway.networks.custom import Network, create
 from midway.networks.inputs import PairInputs
-from midway.networks.mlp import MLP, Precision
+from midway.networks.mlp import Precision
 
 
 class TwinCritic(eqx.Module):
@@ -15,8 +16,8 @@ class TwinCritic(eqx.Module):
     Two networks rather than one batched product: on processors the latter is no faster.
     """
 
-    first: MLP
-    second: MLP | None
+    first: Network
+    second: Network | None
     inputs: PairInputs
 
     def __init__(
@@ -29,11 +30,12 @@ class TwinCritic(eqx.Module):
         inputs: PairInputs | None = None,
         layer_norm: bool = False,
         count: int = 2,
+        custom: str = "",
     ) -> None:
         keys = jax.random.split(key)
-        layers = (input_size, hidden, 1, precision)
-        self.first = MLP(*layers, key=keys[0], layer_norm=layer_norm)
-        second = MLP(*layers, key=keys[1], layer_norm=layer_norm)
+        layers = (custom, (input_size, hidden, 1), precision)
+        self.first = create(*layers, key=keys[0], layer_norm=layer_norm)
+        second = create(*layers, key=keys[1], layer_norm=layer_norm)
         self.second = second if count == 2 else None
         self.inputs = inputs or PairInputs()
 

@@ -14,8 +14,9 @@ from midway.functional import (
     laplace_log_density,
     tanh_log_determinant,
 )
+from midway.networks.custom import Network, create
 from midway.networks.inputs import PairInputs
-from midway.networks.mlp import MLP, Precision
+from midway.networks.mlp import Precision
 
 
 class Gaussian(NamedTuple):
@@ -67,7 +68,7 @@ class Laplace(NamedTuple):
 class GaussianPolicy(eqx.Module):
     """π_θ(a | s, g) = tanh N(μ_θ(s, g), Σ_θ(s, g)) (appendix B, actor-critic)."""
 
-    network: MLP
+    network: Network
     inputs: PairInputs
 
     def __init__(
@@ -79,9 +80,11 @@ class GaussianPolicy(eqx.Module):
         *,
         key: Key[Array, ""],
         inputs: PairInputs | None = None,
+        custom: str = "",
     ) -> None:
         self.inputs = inputs or PairInputs()
-        self.network = MLP(input_size, hidden, 2 * action_dim, precision, key=key)
+        sizes = (input_size, hidden, 2 * action_dim)
+        self.network = create(custom, sizes, precision, key=key)
 
     def __call__(self, observation: Float[Array, "..."], goal: Float[Array, "..."]) -> Gaussian:
         """Return the distribution of pre-tanh actions; inputs may broadcast as in `MLP`."""
@@ -92,7 +95,7 @@ class GaussianPolicy(eqx.Module):
 class SubgoalPolicy(eqx.Module):
     """π^H_ψ(s_g | s, g), the high-level policy: a Laplace over states (appendix B)."""
 
-    network: MLP
+    network: Network
     inputs: PairInputs
 
     def __init__(
@@ -104,9 +107,11 @@ class SubgoalPolicy(eqx.Module):
         *,
         key: Key[Array, ""],
         inputs: PairInputs | None = None,
+        custom: str = "",
     ) -> None:
         self.inputs = inputs or PairInputs()
-        self.network = MLP(input_size, hidden, 2 * subgoal_size, precision, key=key)
+        sizes = (input_size, hidden, 2 * subgoal_size)
+        self.network = create(custom, sizes, precision, key=key)
 
     def __call__(self, observation: Float[Array, "..."], goal: Float[Array, "..."]) -> Laplace:
         """Return the distribution of subgoals between each observation and goal."""

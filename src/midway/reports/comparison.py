@@ -85,6 +85,7 @@ def _pictures(slug: str, environments: Sequence[Runs]) -> Iterator[Picture]:
         "interval holds 50 %, nobody can tell. Intervals of 95 % count seeds and episodes; few "
         "seeds say little of seeds that were not run.",
         "Probability of improvement: " + "; ".join(said) + ".",
+        "; ".join(said) + ". One side is better only where the interval leaves out 50 %.",
     )
 
 

@@ -9,6 +9,7 @@ from midway.reports import (
     comparison,
     curves,
     difficulty,
+    failures,
     health,
     images,
     imagined,
@@ -22,6 +23,7 @@ from midway.reports.page import Section, Shown
 from midway.reports.runs import RunData, Runs, by_environment, read
 from midway.reports.style import Picture
 from midway.runs.policy import Which
+from midway.training.progress import stage
 
 PAGE = "report.html"
 TABLES = "data"
@@ -33,6 +35,7 @@ FIGURES: tuple[Figures, ...] = (
     curves.figures,
     comparison.figures,
     maze.figures,
+    failures.figures,
     difficulty.figures,
     imagined.figures,
     tabletop.figures,
@@ -42,11 +45,15 @@ FIGURES: tuple[Figures, ...] = (
 """Every figure of an environment, in the order of the page."""
 
 
-def report(paths: Sequence[Path], out: Path | None = None, policy: Which = "last") -> list[Path]:
+def report(
+    runs: str | Path | Sequence[str | Path],
+    out: str | Path | None = None,
+    policy: Which = "last",
+) -> list[Path]:
     """Draw what run folders hold, and one page with all of it.
 
     Args:
-        paths: Run folders; agents, seeds and environments may differ.
+        runs: A run folder, or several; agents, seeds and environments may differ.
         out: Where the files go; default: ``figures`` in the run's folder, or for several runs
             ``report`` beside the first one.
         policy: Whose episodes, subgoals and values are drawn: ``last``, ``best``, or a step whose
@@ -58,17 +65,19 @@ def report(paths: Sequence[Path], out: Path | None = None, policy: Which = "last
     Raises:
         ConfigurationError: A path is no run folder, or ``out`` cannot be written.
     """
+    paths = [Path(run) for run in ([runs] if isinstance(runs, str | Path) else runs)]
     if not paths:
         raise ConfigurationError("no run folder given")
     folders = {path.resolve(): path for path in paths}
-    runs = [read(path, policy) for path in folders.values()]
-    if out is None:
-        out = runs[0].folder.figures if len(runs) == 1 else paths[0].resolve().parent / "report"
+    found = [read(path, policy) for path in folders.values()]
+    alone = len(found) == 1
+    place = found[0].folder.figures if alone else paths[0].resolve().parent / "report"
+    place = place if out is None else Path(out)
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        return _write(runs, out)
+        place.mkdir(parents=True, exist_ok=True)
+        return _write(found, place)
     except OSError as error:
-        raise ConfigurationError(f"cannot write the report to {out}: {error.strerror}") from error
+        raise ConfigurationError(f"cannot write the report to {place}: {error.strerror}") from error
 
 
 def pictures(runs: Runs, cache: Cache) -> Iterator[Picture]:
@@ -100,7 +109,11 @@ def _section(runs: Runs, out: Path) -> Section:
 
 def _drawn(found: Iterator[Picture], out: Path) -> list[Shown]:
     """Draw figures one by one and write their files."""
-    return [Shown(picture, style.save(picture.draw(), out / picture.stem)) for picture in found]
+    shown = []
+    for picture in found:
+        shown.append(Shown(picture, style.save(picture.draw(), out / picture.stem)))
+        stage(f"drawn {picture.stem}", len(shown), len(shown))
+    return shown
 
 
 def _unfinished(runs: Runs) -> Iterator[str]:

@@ -67,6 +67,8 @@ def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
             f"uniform {success_text(group, 'uniform')}"
             for group in runs.groups
         ),
+        "The earlier a curve rises and the steadier it stays, the better. Where intervals overlap, "
+        "or there is one seed, one curve above another may be luck.",
     )
     names = distances(runs)
     if names:
@@ -77,6 +79,7 @@ def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
             "Mean distance at the end of the evaluations' episodes of the deterministic policy, "
             "each by itself; an episode succeeds where all are below their threshold at once.",
             f"Distance of {' and '.join(names)} to their goals over environment steps, by task.",
+            "The distance that stays high is what episodes fail by.",
         )
 
 
@@ -91,6 +94,8 @@ def overview(environments: Sequence[Runs]) -> Iterator[Picture]:
             "seeds with 95 % intervals that count episodes and seeds; all environments together "
             "where they have the same agents.",
             "Learning curves of every environment.",
+            "An agent is better where its interval lies above the others' in every environment; "
+            "one that leads in some only suits those.",
         )
 
 

@@ -25,6 +25,7 @@ from midway.runs.policy import Policy
 from midway.training import seeds
 from midway.training.arrays import load_arrays, named_arrays, save_arrays
 from midway.training.pretrain import sample_states
+from midway.training.progress import stage
 from midway.types import AnyArray, VectorGoalEnv
 
 Result = TypeVar("Result")
@@ -139,7 +140,8 @@ def fit_to(
     fitted: Fit = decoder, _adam(updates).init(eqx.filter(decoder, eqx.is_inexact_array))
     for first in range(0, updates, UPDATES_PER_CALL):
         numbers = jnp.arange(first, min(first + UPDATES_PER_CALL, updates))
-        fitted = _updates(fitted, features, images, key, numbers, updates)
+        stage("decoder for figures", first, updates)
+        fitted = jax.block_until_ready(_updates(fitted, features, images, key, numbers, updates))
     return fitted[0]
 
 

@@ -46,6 +46,8 @@ def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
         "episodes (bootstrap), or the episodes of a single seed (Wilson).",
         f"Success on {runs.env} by length of the shortest path"
         + (" and by numbered case." if cases else "."),
+        "Success that falls to the right: the policy reaches what is near, and does not find long "
+        "ways. Success that is low everywhere: it does not move well.",
     )
 
 

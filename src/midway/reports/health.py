@@ -120,6 +120,8 @@ def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
         f"{len(shown)} quantities over environment steps: "
         f"{', '.join(panel.title for panel in shown)}. Healthy: "
         + " ".join(panel.healthy for panel in shown),
+        "A curve that does what its grey text calls unhealthy is the first thing to look into "
+        "where success stays low.",
     )
 
 

@@ -79,6 +79,8 @@ def _imagined_picture(runs: Runs, group: Group, study: Study) -> Picture:
         f"Images of {runs.env}: states, goals"
         + (" and imagined subgoals" if imagines else "")
         + f" of {group.label}, on random and on hard configurations.",
+        "What the decoded state and goal do not show, the policy hardly knows: look for the puck."
+        + (" A sound subgoal lies between the two." if imagines else ""),
     )
 
 
@@ -90,6 +92,7 @@ def _kept_picture(runs: Runs, group: Group, study: Study) -> Picture:
         "New states of the environment, and what is decoded from their latent numbers: "
         f"{group.label} plans its subgoals in these ({study.where}).",
         f"States of {runs.env} and their reconstructions.",
+        "What is lost below the images cannot be planned for: look for the puck.",
     )
 
 

@@ -66,6 +66,8 @@ def _subgoal_picture(runs: Runs, cache: Cache, group: Group, study: Study) -> Pi
         "that comes from imagining again between start, subgoals and goal: the largest mark is "
         "the first subgoal, smaller ones halve what is left.",
         f"Heat map of imagined subgoals at {count} snapshots of training, and the subgoal chain.",
+        "Sound subgoals draw together in the corridor, about half of the way from the goal, and "
+        "their chain follows the corridors; a cloud in walls or beside the way helps no policy.",
     )
 
 
@@ -76,9 +78,10 @@ def _value_picture(runs: Runs, unit: str, studies: Sequence[tuple[Group, Study]]
         lambda: draw_values(labels, unit),
         f"Value of a goal: {', '.join(labels)}",
         "Value of every place for the goal of the hard task, from which the agent starts at rest. "
-        "Bright: near by its own reckoning; a sound value follows the corridors, not the straight "
-        "line.",
+        "Bright: near by its own reckoning.",
         f"Map of {unit} for {', '.join(labels)} on {runs.env}.",
+        "A sound value darkens along the corridors; one that shines through walls takes the "
+        "straight line for the way.",
     )
 
 

@@ -59,6 +59,10 @@ def _picture(runs: Runs, group: Group, study: Study) -> Picture:
         f"Map of {runs.env} with the ways of {group.label}; success over all recorded episodes: "
         + ", ".join(f"{task} {_rate(study, task)}" for task in SHOWN)
         + ".",
+        "Of all recorded episodes the policy reaches "
+        + ", ".join(f"{_rate(study, task)} of {task}" for task in SHOWN)
+        + ". Ways that bend around walls show that it knows the maze; ways that end at a wall "
+        "on the straight line to the goal, that it does not.",
     )
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from midway.agent import AgentState, AnyAgent, Memory, SubgoalDistribution
 from midway.runs.policy import Policy
 from midway.training.evaluate import rollout
+from midway.training.progress import stages_of
 from midway.types import NumPyArray, VectorGoalEnv
 
 Found = TypeVar("Found")
@@ -82,7 +83,9 @@ def record(
     seen = [(observation["observation"].copy(), env.success_pair(observation)[0].copy())]
     actor, plans, reached = policy.actor(), [], np.zeros(len(tasks), np.bool_)
     lengths, drawn = np.zeros(len(tasks), np.int64), [pictures(env)]
+    told = stages_of("steps of recorded episodes", policy.spec.max_episode_steps)
     for moment in rollout(env, actor, observation):
+        told()
         states = env.success_pair(moment.observation)[0]
         seen.append((moment.observation["observation"].copy(), states.copy()))
         plans.append(plan(policy, actor.memory))

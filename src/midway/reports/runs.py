@@ -66,8 +66,9 @@ class RunData:
 
     @property
     def finished(self) -> bool:
-        """Whether all configured steps were taken."""
-        return self.steps >= self.config.train.steps
+        """Whether all configured steps were taken, or those until it was ended early."""
+        ended = self.folder.ended_at()
+        return self.steps >= (self.config.train.steps if ended is None else ended)
 
     @property
     def has_policy(self) -> bool:

@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.text import Text
 
+from midway.envs.geodesic import way_left
 from midway.envs.views import MazeView, TableView
 from midway.reports import decoder, style, tabletop
 from midway.reports import maze as maps
@@ -110,6 +111,7 @@ class MazeScene:
         self._subgoals = None if found is None else found[..., view.position]
         self._kind = recording.kind
         self._words = Words(policy, recording, unit=1.0)
+        self._words.along(view, recording)
         figure, (axes,) = maps.panels(view.maze, 1)
         _head(axes, title)
         maps.draw_ends(axes, self._path[0], recording.target[view.position], size=1.4)
@@ -345,6 +347,13 @@ class Words:
         self._distances = named or {"": task.distance(*pair)}
         self._end = recording.length if recording.success else -1
         self._unit = unit
+        self._where = "to the goal"
+
+    def along(self, view: MazeView, recording: Recording) -> None:
+        """Measure along the corridors of a maze: a straight line says little there."""
+        path, goal = recording.states[:, view.position], recording.target[view.position]
+        self._distances = {"": way_left(view.maze, path, goal)}
+        self._where = "of the way left"
 
     def after(self, step: int) -> str:
         """Return the words after so many steps."""
@@ -355,7 +364,7 @@ class Words:
             f"{name + ' ' if name else ''}{distances[step] / (self._unit or 1.0):.{digits}f}{unit}"
             for name, distances in self._distances.items()
         )
-        return f"step {step}, {', '.join(parts)} to the goal"
+        return f"step {step}, {', '.join(parts)} {self._where}"
 
 
 def decoding(folder: RunFolder, policy: Policy) -> Callable[[Recording], Images | None]:

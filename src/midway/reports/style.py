@@ -63,6 +63,7 @@ class Picture:
         title: Its heading on the page.
         caption: How to read it.
         description: What it shows, for those who do not see it.
+        conclusion: What to conclude from it.
     """
 
     stem: str
@@ -70,6 +71,7 @@ class Picture:
     title: str
     caption: str
     description: str
+    conclusion: str = ""
 
 
 def file_name(text: str) -> str:

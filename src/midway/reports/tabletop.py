@@ -49,6 +49,9 @@ def _picture(runs: Runs, group: Group, study: Study) -> Picture:
         "are states, are those at the start.",
         f"Plan of the table with {len(episodes)} episodes of {group.label}, "
         f"{sum(episode.success for episode in episodes)} of which reach the goal.",
+        f"{sum(episode.success for episode in episodes)} of {len(episodes)} episodes reach their "
+        "goal. A puck that lies where it lay was never touched; one that lies off its goal was "
+        "pushed, and not far or not straight enough.",
     )
 
 

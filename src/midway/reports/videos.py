@@ -19,6 +19,7 @@ from midway.reports.runs import RunData, agent_labels, read
 from midway.reports.scenes import Frame, Scene
 from midway.runs import policy as policies
 from midway.runs.policy import Which
+from midway.training.progress import stage
 
 SECONDS = 8
 """How long a long episode takes in the video; short ones are shown at the lowest rate."""
@@ -39,8 +40,8 @@ RENDERING = ("PYOPENGL_PLATFORM", "MUJOCO_GL")
 
 
 def watch(
-    path: Path,
-    out: Path | None = None,
+    path: str | Path,
+    out: str | Path | None = None,
     task: str | None = None,
     episodes: int = 1,
     seed: int = 0,
@@ -63,9 +64,9 @@ def watch(
     Raises:
         ConfigurationError: The folder, policy, task, number or file cannot be used.
     """
-    run = read(path, policy)
+    run = read(Path(path), policy)
     task = task or run.config.declaration().shown_task
-    out = out or run.folder.path / "videos" / f"{task}.mp4"
+    out = Path(out or run.folder.path / "videos" / f"{task}.mp4")
     if out.suffix not in RATES:
         raise ConfigurationError(f"{out}: a video is named {' or '.join(RATES)}")
     frames, rate = film(run, task, episodes, seed, RATES[out.suffix])
@@ -74,7 +75,7 @@ def watch(
 
 
 def show(
-    path: Path,
+    path: str | Path,
     task: str | None = None,
     episodes: int = 1,
     seed: int = 0,
@@ -92,7 +93,7 @@ def show(
     Raises:
         ConfigurationError: As in ``watch``, or there is no display here.
     """
-    run = read(path, policy)
+    run = read(Path(path), policy)
     task = task or run.config.declaration().shown_task
     check_display()
     frames, rate = film(run, task, episodes, seed, RATES[".mp4"])
@@ -118,12 +119,13 @@ def film(
     longest = max(recording.length for recording in recordings)
     rate = int(np.clip(longest / SECONDS, *rates))
     stride = max(1, round(longest / SECONDS / rate))
-    frames = (
-        frame
-        for recording in recordings
-        for frame in _frames(make(recording), recording, stride, rate)
-    )
-    return frames, rate
+
+    def frames() -> Iterator[Frame]:
+        for number, recording in enumerate(recordings):
+            stage("episode in the video", number, len(recordings))
+            yield from _frames(make(recording), recording, stride, rate)
+
+    return frames(), rate
 
 
 def write(path: Path, frames: Iterator[Frame], rate: int) -> None:

@@ -8,8 +8,16 @@ from midway.training.checkpoint import steps_in
 
 
 def missing(folder: RunFolder, steps: int) -> str:
-    """Return what is missing of the last of these steps: nothing if the run is finished."""
+    """Return what is missing of the last of these steps: nothing if the run is finished.
+
+    A run that was ended early has its last step there.
+
+    Raises:
+        ConfigurationError: This is no run folder.
+    """
     last = max(steps_in(folder.checkpoints), default=0)
+    if (ended := folder.ended_at()) is not None:
+        steps = min(steps, ended)
     if last < steps:
         return f"checkpoint of step {steps}"
     if policy_step(folder) != last:

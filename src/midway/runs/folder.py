@@ -2,14 +2,8 @@
 
 import dataclasses
 import hashlib
-import importlib.metadata
 import json
-import os
-import platform
 import re
-import shlex
-import subprocess
-import sys
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +15,9 @@ from midway.envs.foreign import Foreign
 from midway.envs.layouts import Layout
 from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
+from midway.plain import check_kinds
 from midway.runs import lock
+from midway.runs.provenance import provenance
 from midway.settings import changed
 from midway.training.checkpoint import Owner
 from midway.training.config import TrainConfig
@@ -33,10 +29,8 @@ FORMAT = 3
 SEALED_SINCE = 3
 """The first format whose files all have checksums."""
 
-OUTSIDE = ("steps", "devices")
+OUTSIDE = ("steps", "devices", "stop_at", "on_env_error")
 """Settings that may change when a run is continued."""
-
-PACKAGES = ("midway", "jax", "equinox", "optax", "mujoco", "gymnasium", "numpy")
 
 
 @dataclass(frozen=True)
@@ -66,6 +60,17 @@ class RunConfig:
     maze: JsonObject | None = None
     data: str | None = None
 
+    def __post_init__(self) -> None:
+        """Check the seed.
+
+        Raises:
+            ConfigurationError: It is none.
+        """
+        if type(self.seed) is not int or not 0 <= self.seed < 2**63:
+            raise ConfigurationError(
+                f"seed {self.seed!r}: must be a whole number from 0 to 2**63 - 1"
+            )
+
     def declaration(self) -> Declaration:
         """Return the declaration of the environment.
 
@@ -73,7 +78,7 @@ class RunConfig:
             ConfigurationError: It cannot be found.
         """
         if self.maze is not None:
-            return environments.own_maze(self.maze["robot"], Layout.from_json(self.maze))
+            return environments.own_maze(str(self.maze.get("robot")), Layout.from_json(self.maze))
         if self.foreign is None:
             return environments.entry(self.env)
         return environments.entry(Foreign.from_json(self.foreign))
@@ -105,7 +110,7 @@ class RunConfig:
         try:
             values = _of_this_format(values)
             agent = registry.get(values["agent"])
-            return RunConfig(
+            config = RunConfig(
                 env=values["env"],
                 agent=values["agent"],
                 preset=values["preset"],
@@ -116,8 +121,10 @@ class RunConfig:
                 maze=values.get("maze"),
                 data=values.get("data"),
             )
+            check_kinds(config)
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigurationError(f"configuration not understood: {error}") from error
+        return config
 
 
 def _of_this_format(values: JsonObject) -> JsonObject:
@@ -220,8 +227,12 @@ class RunFolder:
             ConfigurationError: There is a run already, other files lie there, or it cannot be made.
         """
         try:
-            if self.path.exists() and (not self.path.is_dir() or self._strangers()):
-                hint = "use `midway resume`" if self.config_file.exists() else "choose another"
+            if self.path.exists() and (not self.path.is_dir() or self.strangers()):
+                hint = (
+                    "use `midway resume` or --overwrite"
+                    if self.config_file.exists()
+                    else "choose another"
+                )
                 raise ConfigurationError(f"run folder {self.path} is not empty: {hint}")
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -229,8 +240,8 @@ class RunFolder:
                 f"cannot make run folder {self.path}: {error.strerror}"
             ) from error
 
-    def _strangers(self) -> list[Path]:
-        """Return what a process that was killed before its ``config.json`` does not leave."""
+    def strangers(self) -> list[Path]:
+        """Return what is there but what a process leaves that is killed before ``config.json``."""
         left = (self.lock_file.name, self.config_file.name + files.UNFINISHED)
         return [path for path in self.path.iterdir() if path.name not in left]
 
@@ -241,7 +252,7 @@ class RunFolder:
             ConfigurationError: There is a run already, other files lie there, or it cannot be made.
         """
         self.prepare()
-        values = {**config.to_json(), "run": config.identity, **provenance()}
+        values = {**config.to_json(), "run": config.identity, "format": FORMAT, **provenance()}
         try:
             write_json(self.config_file, values)
         except OSError as error:
@@ -252,9 +263,23 @@ class RunFolder:
     def note_resume(self, config: RunConfig) -> None:
         """Add to ``config.json`` how the run was continued, and its new number of steps."""
         values = read_json(self.config_file)
-        again = {**provenance(), "steps": config.train.steps}
+        again = {"format": FORMAT, **provenance(), "steps": config.train.steps}
         continued = {**values, **config.to_json(), "resumed": [*values.get("resumed", []), again]}
         write_json(self.config_file, continued)
+
+    def note_end(self, step: int | None) -> None:
+        """Add to ``config.json`` the step that the run was ended at early; None: it goes on."""
+        values = {name: v for name, v in read_json(self.config_file).items() if name != "ended_at"}
+        write_json(self.config_file, values | ({} if step is None else {"ended_at": step}))
+
+    def ended_at(self) -> int | None:
+        """Return the step that the run was ended at before its settings do, if it was.
+
+        Raises:
+            ConfigurationError: This is no run folder.
+        """
+        step = read_json(self.config_file).get("ended_at")
+        return step if isinstance(step, int) else None
 
     def remove_unfinished(self) -> None:
         """Remove files that a process which was killed did not finish writing."""
@@ -300,41 +325,6 @@ class RunFolder:
             raise ConfigurationError(f"{self.config_file}: {error}") from error
 
 
-def provenance() -> JsonObject:
-    """Return format, versions, commit, machine and command."""
-    return {
-        "format": FORMAT,
-        "versions": {
-            "python": platform.python_version(),
-            **{name: importlib.metadata.version(name) for name in PACKAGES},
-        },
-        "commit": _commit(),
-        "machine": {"processor": platform.machine(), "cores": len(os.sched_getaffinity(0))},
-        "command": _command(),
-    }
-
-
-def _command() -> str:
-    """Return the command that this process is, as it is typed; ``python -m midway.cli`` too."""
-    program = Path(sys.argv[0])
-    name = "midway" if program.name == "__main__.py" else program.name
-    return shlex.join([name, *sys.argv[1:]])
-
-
-def _commit() -> str | None:
-    """Return the commit of the source tree that the package runs from, if it is one."""
-    try:
-        answer = subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"],
-            capture_output=True,
-            text=True,
-            timeout=10,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return answer.stdout.strip() if answer.returncode == 0 else None
-
-
 def write_json(path: Path, values: JsonObject) -> None:
     """Write values with their checksum, in a file that is there whole or not at all.
 
@@ -351,12 +341,12 @@ def read_json(path: Path) -> JsonObject:
         ConfigurationError: The file cannot be read, holds no JSON object, or was changed.
     """
     try:
-        values = json.loads(path.read_text())
+        values = files.parsed(path.read_text())
     except OSError as error:
         raise ConfigurationError(
             f"{path.parent} is no readable run folder: {path.name}: {error.strerror}"
         ) from error
-    except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, absurd numbers or depth
+    except ValueError as error:  # no JSON, no UTF-8, absurd numbers or depth
         raise ConfigurationError(f"{path} is damaged: {error}") from error
     if not isinstance(values, dict):
         raise ConfigurationError(f"{path} is damaged: it holds no JSON object")

@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
+from midway import files
 from midway.errors import ConfigurationError
 
 
@@ -72,7 +73,7 @@ def _myself() -> dict[str, object]:
 def _owner(file: IO[str]) -> str:
     file.seek(0)
     try:
-        owner = json.loads(file.read())
+        owner = files.parsed(file.read())
         return f"pid {owner['pid']} on {owner['host']}, since {owner['since']}"
     except (OSError, ValueError, KeyError, TypeError):
         return "it does not say which"

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
+from midway import functional
 from midway.agent import AgentState, AnyAgent, Encoder, Inputs, Memory, SubgoalDistribution
 from midway.agents import registry
 from midway.envs import own_spaces
@@ -124,7 +125,7 @@ class Policy:
         states, goals, single = own_spaces.seen(self.spec, foreign, observation)
         drawn = np.random.SeedSequence(seed).generate_state(1)[0]
         actions = self._act(states, goals, jax.random.key(int(drawn)), explore=not deterministic)
-        own = own_spaces.in_own_bounds(foreign, actions)
+        own = own_spaces.in_own_bounds(self.spec, foreign, actions)
         return own[0] if single else own
 
     def actor(self, actions: ActionKind = "mean", seed: int = 0) -> acting.Actor:
@@ -204,6 +205,14 @@ def _act_on(
 ) -> tuple[Float[Array, "B A"], Memory]:
     pair = (_read(encoder, observation), _read(encoder, goal))
     return acting.act(agent, state, memory, *pair, key, explore=explore)
+
+
+def current(config: RunConfig, training: Training) -> Policy:
+    """Return a copy of the policy of a run in memory, which outlives the next update."""
+    state = functional.copy(training.state)
+    step = training.counters.steps
+    agent, spec = training.setup.agent, training.env_spec
+    return Policy(agent, state, config, spec, step, training.encoder)
 
 
 def save(folder: RunFolder, config: RunConfig, training: Training) -> None:
@@ -305,27 +314,54 @@ def load(folder: RunFolder, weights: Path | None = None) -> Policy:
     Raises:
         ConfigurationError: The folder holds no policy, or a damaged one.
     """
-    description, config, spec = _described(folder)
+    description, config, spec = described(folder)
     agent = registry.get(config.agent)
-    state = create_state(agent, config.hyperparameters, spec, jax.random.key(0))
     newest = folder.policy_weights
-    path, encoder = weights or newest, None
-    if agent.freezing and any(name.startswith(FROZEN) for name in array_names(path)):
-        encoder = agent.freezing.encoder(state)
-        features = freeze.encoded_spec(spec, encoder)
-        state = create_state(agent, config.hyperparameters, features, jax.random.key(0))
-    parts = networks_of(state, agent.networks) | _frozen(encoder)
-    run = description.get("run")
+    path, run = weights or newest, description.get("run")
+    frozen = bool(agent.freezing) and any(name.startswith(FROZEN) for name in array_names(path))
+    parts, features = expected(config, spec, frozen)
     arrays = load_arrays(path, parts, {"run": run} if run else None)
-    if encoder is not None:
-        encoder = eqx.combine(arrays.pop(FROZEN), encoder)
+    key = jax.random.key(0)
+    encoder = None
+    if agent.freezing and frozen:
+        whole = create_state(agent, config.hyperparameters, spec, key)
+        encoder = eqx.combine(arrays.pop(FROZEN), agent.freezing.encoder(whole))
+    # Made only where the file has the arrays: what describes it may ask for any amount of memory.
+    state = create_state(agent, config.hyperparameters, features, key)
     loaded = {name: eqx.combine(arrays[name], getattr(state, name)) for name in arrays}
     state = dataclasses.replace(state, **loaded)
     step = (description if path == newest else said_of(path)).get("step")
     return Policy(agent, state, config, spec, step, encoder)
 
 
-def _described(folder: RunFolder) -> tuple[JsonObject, RunConfig, EnvSpec]:
+def expected(config: RunConfig, spec: EnvSpec, frozen: bool) -> tuple[dict[str, PyTree], EnvSpec]:
+    """Return the shapes of a policy's arrays by part, and what its networks were made for.
+
+    Raises:
+        ConfigurationError: No networks can be made of these settings for this environment.
+    """
+    agent, key = registry.get(config.agent), jax.random.key(0)
+    try:
+        shapes = eqx.filter_eval_shape(agent.create, config.hyperparameters, spec, key)
+        parts = {}
+        if agent.freezing and frozen:
+            encoder = agent.freezing.encoder(shapes)
+            spec, parts[FROZEN] = freeze.encoded_spec(spec, encoder), eqx.filter(encoder, _is_shape)
+            shapes = eqx.filter_eval_shape(agent.create, config.hyperparameters, spec, key)
+    except Exception as error:  # whatever settings make of shapes that do not fit each other
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ConfigurationError(
+            f"{config.agent} for {spec.name} cannot be made: {reason}"
+        ) from error
+    networks = {name: eqx.filter(getattr(shapes, name), _is_shape) for name in agent.networks}
+    return networks | parts, spec
+
+
+def _is_shape(leaf: object) -> bool:
+    return isinstance(leaf, jax.ShapeDtypeStruct)
+
+
+def described(folder: RunFolder) -> tuple[JsonObject, RunConfig, EnvSpec]:
     """Return what ``policy.json`` holds, and the run and environment that it describes.
 
     Raises:

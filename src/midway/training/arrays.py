@@ -94,7 +94,7 @@ def said_of(path: Path) -> JsonObject:
     if not metadata:
         return {}
     try:
-        said = json.loads(metadata[ABOUT])
+        said = files.parsed(metadata[ABOUT])
         checked = isinstance(said, dict) and files.SEAL in said
     except (KeyError, ValueError):
         checked = False
@@ -134,9 +134,11 @@ def checked_arrays(path: Path) -> tuple[dict[str, NumPyArray], JsonObject]:
     said = said_of(path)
     try:
         arrays: dict[str, NumPyArray] = load_file(path)
-    except (OSError, SafetensorError) as error:
+    except (OSError, SafetensorError, ValueError, TypeError, KeyError) as error:  # absurd shapes
         raise ConfigurationError(f"{path} cannot be read: {error}") from error
     expected = said.get("arrays", {})
+    if not isinstance(expected, dict):
+        raise ConfigurationError(f"{path} is damaged: it does not say what it holds")
     for name in expected.keys() & arrays.keys():
         if (found := _checksum(arrays[name])) != expected[name]:
             raise ConfigurationError(

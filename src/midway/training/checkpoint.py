@@ -176,6 +176,8 @@ class Checkpoints:
                     f"{name} says it is of step {manifest['step']}, format {manifest['format']}; "
                     f"expected step {step}, format {FORMAT}"
                 )
+            if not isinstance(manifest["spec"], dict | None):
+                raise TypeError(f"spec {manifest['spec']!r}")
             self._check_owner(name, manifest["owner"])
             _check_files(name, folder, manifest["files"])
         except (KeyError, TypeError, AttributeError) as error:
@@ -214,8 +216,8 @@ class Checkpoints:
                     self._folder / str(step) / ARRAYS, args=ocp.args.StandardRestore(target)
                 )
             return restored
-        except (ValueError, KeyError, OSError) as error:
-            reason = str(error).splitlines()[0]
+        except Exception as error:  # whatever Orbax makes of arrays that somebody else wrote
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise ConfigurationError(
                 f"checkpoint of step {step} cannot be read: {reason}"
             ) from error
@@ -237,7 +239,7 @@ class Checkpoints:
         if not path.exists() and not (self._owner and self._owner.sealed):
             return None
         try:
-            manifest = json.loads(path.read_text())
+            manifest = files.parsed(path.read_text())
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise ConfigurationError(
@@ -263,16 +265,18 @@ class Checkpoints:
         try:
             with _quiet():
                 found = self._checkpointer.metadata(self._folder / str(step) / ARRAYS)
-        except (ValueError, KeyError, OSError):
+            return dict(found.item_metadata or {})
+        except Exception:  # as above; restoring says what is wrong
             return {}
-        return dict(found.item_metadata or {})
 
     def _stored(self, step: int, like: Stored) -> Stored:
-        """Return ``like`` without the sums that checkpoints of earlier versions do not have."""
-        if "logged" in self._metadata(step).get("collector", {}):
-            return like
-        kept = {name: part for name, part in like["collector"].items() if name != "logged"}
-        return {**like, "collector": kept}
+        """Return ``like`` without the counts that checkpoints of earlier versions do not have."""
+        there = self._metadata(step).get("collector", {})
+        parts = {name: part for name, part in like["collector"].items() if name in there}
+        if "counts" in parts:
+            counts = parts["counts"].items()
+            parts["counts"] = {n: count for n, count in counts if n in there["counts"]}
+        return {**like, "collector": parts}
 
 
 def steps_in(folder: Path) -> list[int]:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 
@@ -10,26 +11,41 @@ from midway.errors import BrokenEnvironmentError, ConfigurationError
 from midway.replay.storage import ReplayState
 from midway.training import faults, step
 from midway.training.checkpoint import Stored
-from midway.types import Info, NumPyArray, Observations, VectorGoalEnv
+from midway.types import Info, NumPyArray, Observations, Step, VectorGoalEnv
 
 Actions = Callable[[Observations], NumPyArray]
 
 
+MOST_IN_A_ROW = 10
+"""Steps, one after the other, in which environments may break before the run stops after all."""
+
+
 @dataclass
 class EpisodeCounts:
-    """What happened in the episodes that ended since the last row of metrics."""
+    """What happened since the last row of metrics.
+
+    Attributes:
+        episodes: Episodes that ended.
+        successes: Those of them that reached their goal.
+        length: Their steps.
+        diverged: Episodes that were cut because their simulation diverged.
+        restarts: Environments that broke and were made anew.
+    """
 
     episodes: int = 0
     successes: int = 0
     length: int = 0
+    diverged: int = 0
+    restarts: int = 0
 
     def metrics(self) -> dict[str, float]:
-        """Return means over the ended episodes; NaN where none ended."""
-        if self.episodes == 0:
-            return {"collect/success_rate": math.nan, "collect/episode_length": math.nan}
+        """Return means over the ended episodes, NaN where none ended, and counts of faults."""
+        none = self.episodes == 0
         return {
-            "collect/success_rate": self.successes / self.episodes,
-            "collect/episode_length": self.length / self.episodes,
+            "collect/success_rate": math.nan if none else self.successes / self.episodes,
+            "collect/episode_length": math.nan if none else self.length / self.episodes,
+            "collect/diverged": float(self.diverged),
+            "collect/restarts": float(self.restarts),
         }
 
 
@@ -46,8 +62,10 @@ class Collector:
             for never.
         logged: Sum and number over the steps since then of each info that the environment wants
             logged, by its name in ``metrics.csv``.
+        restarts: Whether the run goes on where an environment breaks that can be made anew.
         moved: Whether the last step was taken; not if an environment raised in it.
-        fault: What was wrong with an environment in the last step.
+        fault: What was wrong with an environment in the last step, where the run cannot go on.
+        in_a_row: Steps until now, one after the other, in which environments broke.
     """
 
     env: VectorGoalEnv
@@ -56,8 +74,10 @@ class Collector:
     counts: EpisodeCounts = field(default_factory=EpisodeCounts)
     limit: int = 0
     logged: dict[str, NumPyArray] = field(default_factory=dict)
+    restarts: bool = False
     moved: bool = True
     fault: BrokenEnvironmentError | None = None
+    in_a_row: int = 0
 
     def __post_init__(self) -> None:
         """Begin the sums that are not given."""
@@ -65,30 +85,44 @@ class Collector:
 
     @staticmethod
     def start(
-        env: VectorGoalEnv, replay: ReplayState, seed: int, limit: int = 0
+        env: VectorGoalEnv,
+        replay: ReplayState,
+        seed: int,
+        limit: int = 0,
+        restarts: bool = False,
     ) -> tuple["Collector", ReplayState]:
         """Reset every environment and begin its first episode in the replay."""
         observation, _ = env.reset(seed=seed)
         everyone = np.ones(env.num_envs, np.bool_)
-        collector = Collector(env, observation, everyone, limit=limit)
+        collector = Collector(env, observation, everyone, limit=limit, restarts=restarts)
         return collector, step.begin(replay, observation, everyone)
 
     def step(self, replay: ReplayState, choose: Actions) -> ReplayState:
         """Take one step in every environment; begin new episodes where one has ended.
 
-        A step in which an environment raises is not taken. One that shows what is not finite is
-        not stored in its environment, where a new episode begins. Both are noted as ``fault``.
+        The step of an environment that breaks, or whose simulation diverges, is not stored, and a
+        new episode begins there. Where the run must stop, that is noted as ``fault``; a step in
+        which an environment of others breaks is not taken then.
         """
         actions = choose(self.observation)
         self.moved, self.fault = True, None
         try:
-            observation, _, terminated, truncated, info = self.env.step(actions)
+            taken = self.env.step(actions)
+            self.in_a_row = 0
         except BrokenEnvironmentError as error:
-            self.moved, self.fault = False, error
-            return replay
-        sound = faults.finite(observation)
-        if not sound.all():
-            self.fault = faults.not_finite(self.env, sound, info, actions)
+            if not self._goes_on(error) or error.step is None:
+                self.moved, self.begun = False, np.full(self.env.num_envs, self.fault is None)
+                return self._begin(replay) if self.fault is None else replay
+            taken = cast(Step, error.step)
+        return self._store(replay, actions, taken)
+
+    def _store(self, replay: ReplayState, actions: NumPyArray, taken: Step) -> ReplayState:
+        observation, _, terminated, truncated, info = taken
+        none = np.zeros(self.env.num_envs, np.bool_)
+        diverged, broken = info.get("diverged", none), info.get("broken", none)
+        sound = faults.finite(observation) & ~diverged & ~broken
+        if not (sound | diverged | broken).all():
+            self.fault = faults.not_finite(self.env, sound | diverged | broken, info, actions)
         self.observation = observation
         for name, column in self.env.logged_info.items():
             self.logged[column] += (info[name][sound].sum(), int(sound.sum()))
@@ -98,6 +132,7 @@ class Collector:
         if self.limit:
             ended = ended | (info["elapsed_steps"] >= self.limit)
         self._count(ended & sound, info)
+        self.counts.diverged += int(diverged.sum())
         self.begun = ended | ~sound
         return self._begin(replay) if self.begun.any() else replay
 
@@ -106,14 +141,25 @@ class Collector:
         self.counts.successes += int((info["is_success"] & ended).sum())
         self.counts.length += int(info["elapsed_steps"][ended].sum())
 
+    def _goes_on(self, error: BrokenEnvironmentError) -> bool:
+        """Return whether the run goes on after an environment broke; note the fault if not."""
+        self.in_a_row += 1
+        if not self.restarts or self.in_a_row > MOST_IN_A_ROW:
+            self.fault = error
+            return False
+        broken = cast(Step, error.step)[-1]["broken"] if error.step is not None else np.ones(1)
+        self.counts.restarts += int(broken.sum())
+        return True
+
     def _begin(self, replay: ReplayState) -> ReplayState:
         """Begin the episodes of ``begun``; where that fails, a resumed run begins all anew."""
-        try:
-            self.observation, _ = self.env.reset(options={"reset_mask": self.begun})
-        except BrokenEnvironmentError as error:
-            self.fault = error
-            return replay
-        return step.begin(replay, self.observation, self.begun)
+        while self.fault is None:
+            try:
+                self.observation, _ = self.env.reset(options={"reset_mask": self.begun})
+                return step.begin(replay, self.observation, self.begun)
+            except BrokenEnvironmentError as error:
+                self._goes_on(error)
+        return replay
 
     def take_metrics(self) -> dict[str, float]:
         """Return means since the last call, NaN where there are none; then start anew."""

@@ -7,6 +7,9 @@ from midway.errors import ConfigurationError
 from midway.settings import check, setting
 from midway.types import RelabelMix
 
+RESTART = "restart"
+"""What `TrainConfig.on_env_error` may be instead of ``stop``."""
+
 LARGEST = 10**12
 """Bound of counts: more could not be run or stored."""
 
@@ -49,7 +52,16 @@ class TrainConfig:
         0, "not in the paper", "steps of an episode in collection; 0: the environment's", least=0
     )
     collect: bool = setting(True, "ours", "whether steps are taken, or counted only")
+    on_env_error: str = setting(
+        "stop",
+        "ours",
+        "what a broken environment of others does: stop the run, or restart",
+        choices=("stop", RESTART),
+    )
     devices: int = setting(1, "ours", "accelerators that batch and replay are split over", least=1)
+    stop_at: float = setting(
+        0.0, "not in the paper", "success that ends the run; 0: none", least=0, most=1
+    )
     task: str = setting("uniform", "appendix C", "starts and goals that are trained on")
 
     def __post_init__(self) -> None:

@@ -57,6 +57,9 @@ class Sinks(Protocol):
     def checkpoint(self, training: Training) -> None:
         """Write all that the future depends on, and the policy."""
 
+    def watched(self, training: Training) -> bool:
+        """Show what was taken last to those who watch; return whether the run ends here."""
+
 
 # --- one turn of the loop -------------------------------------------------------------------------
 
@@ -68,11 +71,11 @@ def advance(training: Training) -> None:
     if train.collect:
         choose = partial(_choose, training)
         training.replay = training.collector.step(training.replay, choose)
-        if not training.collector.moved:
-            return
     if (begun := training.collector.begun).any():
         fresh = training.begin_episodes(train.num_envs)
         training.memory = acting.renew(training.memory, fresh, begun)
+    if not training.collector.moved:
+        return
     steps, updates = training.counters.steps + train.num_envs, training.counters.updates
     while train.updates_due(steps) - updates >= train.updates_per_call:
         training.arrays, training.totals = training.program.train(
@@ -172,7 +175,7 @@ def check_finite(training: Training) -> None:
 
 
 def run(training: Training, sinks: Sinks, asked: Asked | None = None) -> bool:
-    """Train until the configured number of steps; return whether all of it is done.
+    """Train until the last step; return whether all of it is done.
 
     What a signal interrupted in an earlier process is done first.
 
@@ -198,7 +201,7 @@ def run(training: Training, sinks: Sinks, asked: Asked | None = None) -> bool:
     if training.counters.steps == 0:
         take_evaluation(training, sinks, success, asked)
         tick()
-    while training.counters.steps < train.steps and asked.end is None:
+    while training.counters.steps < training.last_step and asked.end is None:
         advance(training)
         if training.collector.moved:
             tick()
@@ -213,7 +216,7 @@ def run(training: Training, sinks: Sinks, asked: Asked | None = None) -> bool:
                 sinks.checkpoint(training)
             _obey(training, sinks, asked)
         _stop_at_fault(training, sinks)
-    finished = training.counters.steps >= train.steps and evaluated
+    finished = training.counters.steps >= training.last_step and evaluated
     if not finished:
         sinks.checkpoint(training)
         sinks.message(f"interrupted: checkpoint of step {training.counters.steps} written")
@@ -223,7 +226,7 @@ def run(training: Training, sinks: Sinks, asked: Asked | None = None) -> bool:
 def is_due(training: Training, every: int) -> bool:
     """Return whether the newest step is the last one, or has passed a multiple of ``every``."""
     train, now = training.setup.train, training.counters.steps
-    return now >= train.steps or now // every > (now - train.num_envs) // every
+    return now >= training.last_step or now // every > (now - train.num_envs) // every
 
 
 def take_evaluation(
@@ -241,9 +244,17 @@ def take_evaluation(
     except BrokenEnvironmentError as fault:
         training.evaluation_envs.clear()
         sinks.message(f"evaluation of step {steps} is left out: {fault}")
-        if steps >= training.setup.train.steps:
+        if steps >= training.last_step:
             training.collector.fault = fault
+    else:
+        _show(training, sinks)
     return True
+
+
+def _show(training: Training, sinks: Sinks) -> None:
+    """Let those who watch see the newest row or evaluations, and end the run if they say so."""
+    if sinks.watched(training):
+        training.ends_at = training.counters.steps
 
 
 def _obey(training: Training, sinks: Sinks, asked: Asked) -> None:
@@ -284,6 +295,7 @@ def _log(training: Training, sinks: Sinks, success: dict[str, float]) -> None:
     give_back_memory()
     speed = counters.steps / max(counters.seconds, 1e-9)
     sinks.progress(counters.steps, {"steps/s": speed, **success})
+    _show(training, sinks)
 
 
 def note_evaluation(

@@ -1,8 +1,11 @@
-"""What a run says on standard error while it trains."""
+"""What is said on standard error while a run trains, or something else takes long."""
 
+import itertools
+import logging
 import sys
-from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Protocol, cast, runtime_checkable
 
 from rich.console import Console
 from rich.progress import (
@@ -15,6 +18,9 @@ from rich.progress import (
 )
 
 from midway.training.terminal import heard, print_line
+
+STAGES = logging.getLogger("midway.stages")
+"""How far long actions are; nothing is shown unless `showing_stages` asks for it."""
 
 
 @runtime_checkable
@@ -78,14 +84,7 @@ class Bar:
     """
 
     def __init__(self, total: int, done: int) -> None:
-        self._progress = Progress(
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[values]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-        )
+        self._progress = _bar("{task.fields[values]}")
         self._task = self._progress.add_task("train", total=total, completed=done, values="")
         self._progress.start()
 
@@ -108,6 +107,81 @@ class Bar:
 def reporter(total: int, done: int) -> Reporter:
     """Return a bar where standard error is a terminal, else plain lines."""
     return Bar(total, done) if sys.stderr.isatty() else Lines(total)
+
+
+def stage(name: str, done: int, total: int) -> None:
+    """Say how far a long action is that is no training."""
+    STAGES.info("%s: %d of %d", name, done, total)
+
+
+def stages_of(name: str, steps: int) -> Callable[[], None]:
+    """Return what is called after each step, and says after every tenth part how far it is."""
+    taken = itertools.count(1)
+
+    def tell() -> None:
+        done = next(taken)
+        if done % max(1, steps // 10) == 0:
+            stage(name, done, steps)
+
+    return tell
+
+
+class _StageBar(logging.Handler):
+    """Shows the stage that was said last as one bar."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._progress = _bar("{task.description}")
+        self._task = self._progress.add_task("", total=None)
+        self._progress.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Move the bar."""
+        name, done, total = cast(tuple[str, int, int], record.args)
+        with heard():
+            self._progress.update(self._task, description=name, completed=done, total=total)
+
+    def close(self) -> None:
+        """Take the bar away."""
+        with heard():
+            self._progress.stop()
+        super().close()
+
+
+class _StageLines(logging.Handler):
+    """Prints a line for each stage."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one line."""
+        print_line(record.getMessage())
+
+
+@contextmanager
+def showing_stages() -> Iterator[None]:
+    """Show how far long actions are: a bar where standard error is a terminal, else lines."""
+    handler = _StageBar() if sys.stderr.isatty() else _StageLines()
+    STAGES.addHandler(handler)
+    STAGES.setLevel(logging.INFO)
+    STAGES.propagate = False
+    try:
+        yield
+    finally:
+        STAGES.removeHandler(handler)
+        STAGES.setLevel(logging.NOTSET)
+        STAGES.propagate = True
+        handler.close()
+
+
+def _bar(text: str) -> Progress:
+    """Return a bar with a text of its task, on standard error."""
+    return Progress(
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(text),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+    )
 
 
 def _describe(values: Mapping[str, float]) -> str:

@@ -18,7 +18,7 @@ from midway.training import acting, demonstrations, freeze, memory, pretrain, se
 from midway.training.arrays import named_arrays, with_named_arrays
 from midway.training.checkpoint import Checkpoints, Stored
 from midway.training.collect import Collector
-from midway.training.config import TrainConfig
+from midway.training.config import RESTART, TrainConfig
 from midway.training.devices import Devices
 from midway.training.pretrain import Check, MakeEnv, Say
 from midway.training.step import Arrays, Program
@@ -84,6 +84,8 @@ class Training:
         streams: Seeds and keys of all draws.
         encoder: The frozen encoder of images; None while there is none.
         counters: How far it is.
+        evaluation_envs: Environments of evaluations by task.
+        ends_at: Step that those who watch the run have ended it at, before its settings do.
     """
 
     setup: Setup
@@ -97,6 +99,12 @@ class Training:
     encoder: Encoder | None = None
     counters: Counters = field(default_factory=Counters)
     evaluation_envs: dict[str, VectorGoalEnv] = field(default_factory=dict)
+    ends_at: int | None = None
+
+    @property
+    def last_step(self) -> int:
+        """The step that the run is finished at."""
+        return self.setup.train.steps if self.ends_at is None else self.ends_at
 
     @property
     def state(self) -> AgentState:
@@ -178,7 +186,7 @@ def _demonstrate(training: Training, trajectories: Iterable[Trajectory], say: Sa
     train, env = setup.train, training.collector.env
     replay, count = demonstrations.fill(training.replay, spec, train.num_envs, trajectories)
     training.collector, training.replay = Collector.start(
-        env, replay, training.streams.env, train.collect_limit
+        env, replay, training.streams.env, train.collect_limit, train.on_env_error == RESTART
     )
     say(f"{count} steps of others in the replay")
 
@@ -198,7 +206,8 @@ def _begin(
     replay = devices.allocate(allocate)
     totals = step.empty_totals(setup.agent, program, arrays, train, replay)
     streams = _streams(setup)
-    collector, replay = Collector.start(env, replay, streams.env, train.collect_limit)
+    limits = (train.collect_limit, train.on_env_error == RESTART)
+    collector, replay = Collector.start(env, replay, streams.env, *limits)
     parts = (program, arrays, devices.copied(totals), replay, (), collector, streams)
     training = Training(setup, *parts, encoder, counters)
     training.memory = training.begin_episodes(train.num_envs)
@@ -322,6 +331,7 @@ def load_state_dict(training: Training, state: Stored) -> None:
         training.collector.env, replay, state["collector"]
     )
     training.collector.limit = training.setup.train.collect_limit
+    training.collector.restarts = training.setup.train.on_env_error == RESTART
     fresh = training.begin_episodes(training.setup.train.num_envs)
     training.memory = acting.renew(training.memory, fresh, training.collector.begun)
     stored = state["counters"]

@@ -18,6 +18,8 @@ SMALLEST_CELL, LARGEST_CELL = 2.0, 100.0
 """An ant keeps 0.75 m from every wall, on both sides."""
 LARGEST_MAP = 100
 """Rows and columns, at most."""
+LARGEST_FILE = 20_000
+"""Characters of a file, at most."""
 NUMBERED = 8
 """Cases of growing distance, at most."""
 TEST_HALF = 0.25
@@ -197,12 +199,15 @@ def read(source: str | Path) -> Layout:
     shipped = resources.files(__name__) / f"{source}.yaml"
     path = Path(source)
     try:
-        text = shipped.read_text() if shipped.is_file() else path.read_text()
+        with shipped.open() if shipped.is_file() else path.open() as file:
+            text = file.read(LARGEST_FILE + 1)
     except (OSError, UnicodeDecodeError) as error:
         known = ", ".join(sorted(names()))
         raise ConfigurationError(
             f"maze {source}: cannot be read ({error}); it is a file, or one of {known}"
         ) from error
+    if len(text) > LARGEST_FILE:
+        raise ConfigurationError(f"maze {source}: has more than {LARGEST_FILE} characters")
     cell: object = CELL
     if shipped.is_file() or path.suffix in (".yaml", ".yml"):
         text, cell = _of_yaml(str(source), text)
@@ -224,7 +229,7 @@ def _of_yaml(source: str, text: str) -> tuple[str, float]:
     """
     try:
         found = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # dates, numbers, depth
         raise ConfigurationError(f"maze {source}: {' '.join(str(error).split())}") from error
     if not isinstance(found, dict) or not {"map"} <= set(found) <= {"map", "cell"}:
         raise ConfigurationError(f"maze {source}: must have map, and may have cell")
