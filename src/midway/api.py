@@ -11,12 +11,13 @@ from midway.configuration import setup_of as setup_of
 from midway.envs.foreign import EnvLike
 from midway.envs.registry import Declaration
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
-from midway.runs import complete
+from midway.runs import complete, kept
 from midway.runs import policy as policies
 from midway.runs.callbacks import Callback, Watchers
 from midway.runs.folder import RunConfig, RunFolder, run_name
+from midway.runs.kept import Which
 from midway.runs.place import clear, free_folder
-from midway.runs.policy import Policy, Which
+from midway.runs.policy import Policy
 from midway.runs.sinks import RunSinks
 from midway.settings import changed
 from midway.training import loop, seeds, signals, state
@@ -172,7 +173,7 @@ def load(path: str | Path, policy: Which = "last") -> Policy:
         ConfigurationError: The folder holds no such policy, or a damaged or foreign one.
     """
     folder = RunFolder.at(path)
-    return policies.load(folder, policies.weights_of(folder, policy))
+    return policies.load(folder, kept.weights_of(folder, policy))
 
 
 def evaluate(

@@ -13,7 +13,7 @@ from midway.cli.main import main
 from midway.errors import ConfigurationError
 from midway.reports import curves
 from midway.reports.runs import by_environment, read
-from midway.runs import policy as policies
+from midway.runs import kept
 from midway.runs.folder import RunFolder
 from midway.training import loop, seeds
 from midway.training.evaluate import Episode, Evaluation
@@ -74,7 +74,7 @@ def expected() -> list[tuple[int, float]]:
 
 
 def test_the_best_policy_won_its_evaluation_and_then_its_own_episodes(whole: Path) -> None:
-    best = policies.best(RunFolder(whole))
+    best = kept.best(RunFolder(whole))
     assert best is not None
     won = expected()
     assert len(won) > 1
@@ -96,7 +96,7 @@ def test_each_evaluation_has_episodes_of_its_own(whole: Path) -> None:
 
 
 def test_a_star_is_where_the_best_policy_was_confirmed(whole: Path) -> None:
-    best = policies.best(RunFolder(whole))
+    best = kept.best(RunFolder(whole))
     assert best is not None
     (runs,) = by_environment([read(whole)])
     stars = [
@@ -111,7 +111,7 @@ def test_a_star_is_where_the_best_policy_was_confirmed(whole: Path) -> None:
 
 
 def test_each_policy_is_loaded_by_its_name(whole: Path) -> None:
-    best = policies.best(RunFolder(whole))
+    best = kept.best(RunFolder(whole))
     assert best is not None
     steps = {which: midway.load(whole, which).step for which in ("last", "best", 60)}
     assert steps == {"last": 120, "best": best.step, 60: 60}
@@ -140,14 +140,14 @@ def test_the_best_is_the_same_after_an_interruption(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int
 ) -> None:
     """Also where the process ends between the evaluation and the episodes that confirm it."""
-    kept, calls = loop._keep_the_best, []
+    original, calls = loop._keep_the_best, []
 
     def interrupted(training: Training, *others: object) -> None:
         if training.counters.steps == stop and not calls:
             calls.append(stop)
             signal.raise_signal(signal.SIGINT)
             raise loop.Interrupted
-        kept(training, *others)  # type: ignore[arg-type]
+        original(training, *others)  # type: ignore[arg-type]
 
     monkeypatch.setattr(loop, "_keep_the_best", interrupted)
     assert not train(tmp_path / "run").finished
@@ -174,7 +174,7 @@ def test_what_a_killed_process_kept_later_does_not_change_the_best(
 def test_a_run_that_reached_nothing_has_no_best_policy(whole: Path, tmp_path: Path) -> None:
     run = shutil.copytree(whole, tmp_path / "run")
     (run / "policies" / "best.safetensors").write_bytes(b"damaged")
-    assert policies.best(RunFolder(run)) is None
+    assert kept.best(RunFolder(run)) is None
     with pytest.raises(ConfigurationError, match="cannot be read"):
         midway.load(run, "best")
     (run / "policies" / "best.safetensors").unlink()

@@ -22,7 +22,7 @@ from midway.reports.cache import Cache
 from midway.reports.page import Section, Shown
 from midway.reports.runs import RunData, Runs, by_environment, read
 from midway.reports.style import Picture
-from midway.runs.policy import Which
+from midway.runs.kept import Which
 from midway.training.progress import stage
 
 PAGE = "report.html"

@@ -15,9 +15,9 @@ from midway.envs import registry as environments
 from midway.envs.views import View
 from midway.errors import ConfigurationError
 from midway.reports import style
-from midway.runs import policy as policies
+from midway.runs import kept
 from midway.runs.folder import RunConfig, RunFolder, read_json, run_name
-from midway.runs.policy import Best, Which
+from midway.runs.kept import Best, Which
 from midway.tables import Table
 from midway.training.arrays import checked_arrays
 from midway.types import JsonObject
@@ -82,12 +82,12 @@ class RunData:
         Raises:
             ConfigurationError: They were not kept.
         """
-        return policies.weights_of(self.folder, self.which)
+        return kept.weights_of(self.folder, self.which)
 
     @property
     def best(self) -> Best | None:
         """How good the best policy is, if one was kept."""
-        return policies.best(self.folder)
+        return kept.best(self.folder)
 
     @property
     def policy_step(self) -> int:
@@ -107,8 +107,8 @@ class RunData:
     @property
     def past_weights(self) -> dict[int, Path]:
         """Weights that were kept before the policy was saved, by step."""
-        kept = policies.snapshots(self.folder)
-        steps = {step: file for step, file in kept.items() if not _damage(file)}
+        found = kept.snapshots(self.folder)
+        steps = {step: file for step, file in found.items() if not _damage(file)}
         return {step: steps[step] for step in sorted(steps) if step < self.policy_step}
 
     @property
@@ -199,8 +199,8 @@ def read(path: Path, policy: Which = "last") -> RunData:
     record = read_json(folder.config_file)
     metrics, wrong = _table(folder.metrics_file, METRICS)
     evaluation, wrong_too = _table(folder.evaluation_file, EVALUATION)
-    kept = [_damage(file) for file in policies.snapshots(folder).values()]
-    damaged = tuple(text for text in (wrong, wrong_too, *kept) if text)
+    weights = [_damage(file) for file in kept.snapshots(folder).values()]
+    damaged = tuple(text for text in (wrong, wrong_too, *weights) if text)
     return RunData(folder, config, record, metrics, evaluation, damaged, policy)
 
 

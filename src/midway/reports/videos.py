@@ -18,7 +18,7 @@ from midway.reports.recordings import Recording, record
 from midway.reports.runs import RunData, agent_labels, read
 from midway.reports.scenes import Frame, Scene
 from midway.runs import policy as policies
-from midway.runs.policy import Which
+from midway.runs.kept import Which
 from midway.training.progress import stage
 
 SECONDS = 8

@@ -1,12 +1,11 @@
 """Saved policies: weights and a description that others can load."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeAlias, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -27,7 +26,6 @@ from midway.runs.folder import (
     read_json,
     write_json,
 )
-from midway.statistics import Estimate, of_policy
 from midway.training import acting, freeze
 from midway.training.acting import Seen
 from midway.training.arrays import array_names, load_arrays, networks_of, said_of, save_arrays
@@ -37,25 +35,6 @@ from midway.training.step import create_state
 from midway.types import AnyArray, EnvSpec, JsonObject, NumPyArray
 
 Found = TypeVar("Found")
-
-
-Which: TypeAlias = Literal["best", "last"] | int
-"""A policy of a run: the best, the last, or that of a step whose weights were kept."""
-
-
-@dataclass(frozen=True)
-class Best:
-    """How good the best policy of a run was on the episodes that confirmed it.
-
-    Attributes:
-        step: The environment step that it is of.
-        task: What starts and goals were drawn from.
-        success: Its success with deterministic actions.
-    """
-
-    step: int
-    task: str
-    success: Estimate
 
 
 @dataclass(frozen=True)
@@ -240,24 +219,9 @@ def keep_best(
 ) -> None:
     """Write the weights to ``policies/best.safetensors``, with what confirmed them."""
     folder.past_policies.mkdir(exist_ok=True)
-    _save_weights(
-        folder.best_weights,
-        folder.identity(config),
-        training,
-        task=confirmed.task,
-        success_rate=confirmed.success_rate,
-        episodes=len(confirmed.episodes),
-    )
-
-
-def best(folder: RunFolder) -> Best | None:
-    """Return how good the best policy is; None if none was kept, or its file is damaged."""
-    try:
-        said = said_of(folder.best_weights)
-        success = of_policy(said["success_rate"], said["episodes"])
-        return Best(said["step"], said["task"], success)
-    except (ConfigurationError, KeyError):
-        return None
+    rate, episodes = confirmed.success_rate, len(confirmed.episodes)
+    about = {"task": confirmed.task, "success_rate": rate, "episodes": episodes}
+    _save_weights(folder.best_weights, folder.identity(config), training, **about)
 
 
 def _save_weights(path: Path, run: str, training: Training, **about: object) -> None:
@@ -271,50 +235,12 @@ def _frozen(encoder: Encoder | None) -> dict[str, PyTree]:
     return {} if encoder is None else {FROZEN: eqx.filter(encoder, eqx.is_array)}
 
 
-def weights_of(folder: RunFolder, which: Which = "last") -> Path:
-    """Return the file of a policy's weights.
-
-    Raises:
-        ConfigurationError: It was not kept; the text names what there is.
-    """
-    if which == "last":
-        return folder.policy_weights
-    if which == "best":
-        if folder.best_weights.exists():
-            return folder.best_weights
-        raise ConfigurationError(
-            f"run folder {folder.path}: no best policy: no evaluation has reached a goal yet, or "
-            "an earlier version trained it"
-        )
-    kept = {**snapshots(folder), **{step: file for file, step in _named(folder)}}
-    if which not in kept:
-        there = ", ".join(map(str, sorted(kept))) or "none"
-        raise ConfigurationError(
-            f"run folder {folder.path}: no policy of step {which} was kept: there are {there}"
-        )
-    return kept[which]
-
-
-def _named(folder: RunFolder) -> Iterator[tuple[Path, int]]:
-    """Yield the files that are called the best and the last, with the steps that they are of."""
-    for file in (folder.best_weights, folder.policy_weights):
-        with suppress(ConfigurationError):
-            if "step" in (said := said_of(file)):
-                yield file, said["step"]
-
-
-def snapshots(folder: RunFolder) -> dict[int, Path]:
-    """Return the weights that were kept on the way, by step."""
-    names = {file.stem.removeprefix("step-"): file for file in folder.past_policies.glob("step-*")}
-    return {int(n): f for n, f in names.items() if n.isdigit() and f.suffix == ".safetensors"}
-
-
 def load(folder: RunFolder, weights: Path | None = None) -> Policy:
     """Return the policy of a run folder; no environment is made.
 
     Args:
         folder: The run folder.
-        weights: Other weights than the newest: a file that `weights_of` returned.
+        weights: Other weights than the newest: a file that `kept.weights_of` returned.
 
     Raises:
         ConfigurationError: The folder holds no policy, or a damaged one.

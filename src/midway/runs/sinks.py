@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from midway.runs import kept
 from midway.runs import policy as policies
 from midway.runs.callbacks import Watchers
 from midway.runs.folder import RunConfig, RunFolder
@@ -72,7 +73,7 @@ class RunSinks:
 
     def is_better(self, result: Evaluation) -> bool:
         """Return whether the lower end of its interval lies above that of the best policy."""
-        best = policies.best(self._folder)
+        best = kept.best(self._folder)
         return result.success.low > (0.0 if best is None else best.success.low)
 
     def best(self, training: Training, confirmed: Evaluation) -> None:
