@@ -57,11 +57,12 @@ class Workers:
     ) -> None:
         self.total, self.limit = total, limit
         self.size = -(-total // count)
-        self._file = tempfile.NamedTemporaryFile()  # noqa: SIM115 - as long as the processes
-        self._file.truncate(total)
-        self._busy = np.memmap(self._file.name, np.uint8, "r", shape=(total,))
+        shared = tempfile.NamedTemporaryFile()  # noqa: SIM115 - as long as the processes
+        self._forget = weakref.finalize(self, shared.close)
+        shared.truncate(total)
+        self._busy = np.memmap(shared.name, np.uint8, "r", shape=(total,))
         self._makers = [
-            functools.partial(make_group, first=first, size=self.size, busy=self._file.name)
+            functools.partial(make_group, first=first, size=self.size, busy=shared.name)
             for first in range(0, total, self.size)
         ]
         self._vector: Any = None
@@ -105,7 +106,7 @@ class Workers:
     def close(self) -> None:
         """End the processes; those that do not end in time are killed."""
         self._finalizer()
-        self._file.close()
+        self._forget()
 
     def _flat(self, answer: tuple[Any, ...]) -> Answer:
         """Return what all environments show, and what they raised by their numbers."""
