@@ -51,7 +51,8 @@ def test_the_folder_of_a_sweep_and_numbers(capsys):
     paths = [word if word.startswith("--") else str(RESULTS / word) for word in sides]
     main(["compare", *paths, "--json"])
     found = json.loads(capsys.readouterr().out)
-    assert (found["env"], found["task"], found["seeds"]) == ("point-u", "hard", [8, 5])
+    counts = [len(runs("point-u-agents/*")), len(runs("precision/*"))]
+    assert (found["env"], found["task"], found["seeds"]) == ("point-u", "hard", counts)
     assert found["names"] == ["TDM and LEAP and CRL", "RIS"]
     assert found["probability"][0] < found["probability"][2] < 1
 
