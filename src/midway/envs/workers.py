@@ -58,6 +58,7 @@ class Workers:
         self.total, self.limit = total, limit
         self.size = -(-total // count)
         self._file = tempfile.NamedTemporaryFile()  # noqa: SIM115 - as long as the processes
+        weakref.finalize(self, self._file.close)
         self._file.truncate(total)
         self._busy = np.memmap(self._file.name, np.uint8, "r", shape=(total,))
         self._makers = [
@@ -105,7 +106,6 @@ class Workers:
     def close(self) -> None:
         """End the processes; those that do not end in time are killed."""
         self._finalizer()
-        self._file.close()
 
     def _flat(self, answer: tuple[Any, ...]) -> Answer:
         """Return what all environments show, and what they raised by their numbers."""
