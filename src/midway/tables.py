@@ -119,8 +119,11 @@ class Appender:
 
 
 def _rows(path: Path) -> list[list[str]]:
+    """Return the rows of a file; a last line without its end was cut, maybe inside a number."""
     with path.open(newline="") as file:
-        return list(csv.reader(file))
+        text = file.read()
+    rows = list(csv.reader(io.StringIO(text, newline="")))
+    return rows if len(rows) < 2 or text.endswith("\n") else rows[:-1]
 
 
 def _replace(path: Path, rows: Sequence[Sequence[object]]) -> None:

@@ -381,7 +381,7 @@ def test_a_process_that_is_gone_is_told() -> None:
 
 
 def test_what_breaks_in_another_process_is_named_and_made_anew() -> None:
-    env = ForeignVectorEnv(describe(fakes.obedient), 2, num_threads=2)
+    env = ForeignVectorEnv(describe(fakes.obedient, Settings(1e-6)), 2, num_threads=2)
     env.reset(seed=0)
     env.step(0 * RIGHT)
     with pytest.raises(BrokenEnvironmentError, match=named("ValueError: the\nsimulator")) as error:
