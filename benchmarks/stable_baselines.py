@@ -12,6 +12,10 @@ Stable-Baselines3, with midway's layers and learning rate. The rows of a run go 
 
 import argparse
 import csv
+import importlib.metadata
+import json
+import shlex
+import sys
 import time
 
 import gymnasium
@@ -28,7 +32,8 @@ EVERY = 4_000
 """Environment steps from evaluation to evaluation."""
 
 EPISODES = 50
-COLUMNS = ("step", "seconds", "training_seconds", "success_rate", "episodes")
+COLUMNS = ("step", "seconds", "training_seconds", "task", "actions", "success_rate", "episodes")
+PARTS = ("stable-baselines3", "torch", "gymnasium", "gymnasium-robotics", "panda-gym")
 
 
 def main() -> None:
@@ -39,6 +44,15 @@ def main() -> None:
     arguments = parser.parse_args()
     folder = RESULTS / "robotics" / f"{arguments.env}-sb3-seed{arguments.seed}"
     folder.mkdir(parents=True, exist_ok=True)
+    config = {
+        "env": arguments.env,
+        "agent": "sac of Stable-Baselines3",
+        "hyperparameters": {"precision": "f32"},
+        "seed": arguments.seed,
+        "versions": {name: importlib.metadata.version(name) for name in PARTS},
+        "command": shlex.join(["python", "benchmarks/stable_baselines.py", *sys.argv[1:]]),
+    }
+    (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
     with (folder / "evaluation.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
@@ -67,7 +81,8 @@ def train(env: str, seed: int):
         training += time.perf_counter() - started
         success = np.mean([reached(model, judged, 1_000 * seed + n) for n in range(EPISODES)])
         seconds = time.perf_counter() - begun
-        yield step, round(seconds, 1), round(training, 1), round(float(success), 4), EPISODES
+        times = round(seconds, 1), round(training, 1)
+        yield step, *times, "uniform", "mean", round(float(success), 4), EPISODES
 
 
 def reached(model: SAC, env: gymnasium.Env, seed: int) -> bool:

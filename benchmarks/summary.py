@@ -3,9 +3,9 @@
     python benchmarks/summary.py benchmarks/results/point-mazes
 
 Success is that of the last evaluation: one seed, or the interquartile mean of several, with the
-95 % interval, which counts episodes and seeds (``midway.statistics``). Minutes are training time
-until an evaluation on the hard task first reached 95 % with the deterministic policy, of the
-slowest seed.
+95 % interval, which counts episodes and seeds (``midway.statistics``). Steps and minutes of
+training until an evaluation of the hard task (uniform, where there is none) first reached 95 %
+with the deterministic policy are those of the slowest seed.
 """
 
 import argparse
@@ -30,21 +30,33 @@ def main() -> None:
             rows = list(csv.DictReader(file))
         key = config["env"], config["agent"], config["hyperparameters"]["precision"]
         groups[key].append(rows)
-    print(
-        "| environment | agent | precision | seeds | steps | hard, mean | hard, sampled | ", end=""
-    )
-    print("uniform, mean | minutes to 95 % |")
-    print("| --- " * 9 + "|")
+    columns = [("hard", "mean"), ("hard", "sampled"), ("uniform", "mean")]
+    columns = [
+        column
+        for column in columns
+        if any(of(rows, *column) for rows in next(iter(groups.values())))
+    ]
+    shown = columns[0][0]
+    titles = ["environment", "agent", "precision", "seeds", "steps"]
+    titles += [f"{task}, {actions}" for task, actions in columns]
+    titles += [f"steps to 95 % of {shown}", "minutes"]
+    print("| " + " | ".join(titles) + " |")
+    print("| --- " * len(titles) + "|")
     for (env, agent, precision), runs in groups.items():
         steps = max(int(rows[-1]["step"]) for rows in runs)
-        cells = [env, agent, precision, str(len(runs)), str(steps)]
-        for task, actions in (("hard", "mean"), ("hard", "sampled"), ("uniform", "mean")):
-            last = [of(rows, task, actions)[-1] for rows in runs]
-            rates = [float(row["success_rate"]) for row in last]
-            success = of_agent(rates, [int(row["episodes"]) for row in last])
-            centre, low, high = (f"{100 * share:.0f}" for share in success)
-            cells.append(f"{centre} % [{low}, {high}]")
-        print("| " + " | ".join([*cells, minutes(runs)]) + " |")
+        cells = [env, agent, precision, str(len(runs)), f"{steps:,}"]
+        cells += [success(runs, *column) for column in columns]
+        print("| " + " | ".join([*cells, *reached(runs, shown)]) + " |")
+
+
+def success(runs: list[Rows], task: str, actions: str) -> str:
+    """Return the success of the last evaluation of all seeds, with its interval."""
+    last = [rows[-1] for run in runs if (rows := of(run, task, actions))]
+    if not last:
+        return ""
+    rates = [float(row["success_rate"]) for row in last]
+    centre, low, high = of_agent(rates, [int(row["episodes"]) for row in last])
+    return f"{100 * centre:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
 
 
 def of(rows: Rows, task: str, actions: str) -> Rows:
@@ -52,16 +64,16 @@ def of(rows: Rows, task: str, actions: str) -> Rows:
     return [row for row in rows if (row["task"], row["actions"]) == (task, actions)]
 
 
-def minutes(runs: list[Rows]) -> str:
-    """Return when the slowest seed reached 95 %, or how many did."""
-    reached = []
-    for rows in runs:
-        good = [row for row in of(rows, "hard", "mean") if float(row["success_rate"]) >= 0.95]
-        if good:
-            reached.append(float(good[0]["training_seconds"]) / 60)
-    if len(reached) < len(runs):
-        return f"{len(reached)} of {len(runs)} seeds"
-    return f"{max(reached):.1f}"
+def reached(runs: list[Rows], task: str) -> tuple[str, str]:
+    """Return when the slowest seed reached 95 % (steps, minutes of training), or how many did."""
+    good = [
+        [row for row in of(run, task, "mean") if float(row["success_rate"]) >= 0.95] for run in runs
+    ]
+    first = [rows[0] for rows in good if rows]
+    if len(first) < len(runs):
+        return f"{len(first)} of {len(runs)} seeds", ""
+    steps = max(int(row["step"]) for row in first)
+    return f"{steps:,}", f"{max(float(row['training_seconds']) for row in first) / 60:.1f}"
 
 
 if __name__ == "__main__":
