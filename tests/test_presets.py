@@ -92,7 +92,8 @@ def test_values_are_those_of_the_presets_before(key: str) -> None:
         assert differ == INTENDED.get(key, {})
 
 
-NEW = {"collect": True, "collect_limit": 0, "normalise": False, **vars(beyond.SubgoalSettings())}
+NEW = {"collect": True, "collect_limit": 0, "on_env_error": "stop", "normalise": False}
+NEW |= vars(beyond.SubgoalSettings())
 """Settings that there were none of, with the values that stand for that."""
 
 FASTER = {
