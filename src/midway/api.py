@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 from midway.agent import AnyAgent
@@ -14,10 +14,11 @@ from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteE
 from midway.runs import complete, kept
 from midway.runs import policy as policies
 from midway.runs.callbacks import Callback, Watchers
-from midway.runs.folder import RunConfig, RunFolder, run_name
+from midway.runs.folder import RunConfig, RunFolder, read_json, run_name
 from midway.runs.kept import Which
 from midway.runs.place import clear, free_folder
 from midway.runs.policy import Policy
+from midway.runs.provenance import changed_here
 from midway.runs.sinks import RunSinks
 from midway.settings import changed
 from midway.training import loop, seeds, signals, state
@@ -284,6 +285,9 @@ def _run(
     training = state.start(setup, say.message if number is None else None, asked.check)
     if number is not None:
         training = state.restore(training, checkpoints, number)
+        with suppress(KeyError, TypeError, IndexError):  # a record that somebody has edited
+            if differs := changed_here(read_json(folder.config_file)):
+                say.message(differs)
         folder.note_resume(config)
     else:
         folder.best_weights.unlink(missing_ok=True)

@@ -26,6 +26,32 @@ def provenance() -> JsonObject:
     }
 
 
+COMPUTING = ("jax", "mujoco")
+"""Packages whose releases may round otherwise."""
+
+
+def changed_here(record: JsonObject) -> str:
+    """Return what here is not as it was where a run went on last, and changes what is computed.
+
+    Args:
+        record: What ``config.json`` holds.
+
+    Returns:
+        One line; nothing if all is as before.
+    """
+    last = [record, *record.get("resumed", [])][-1]
+    now = provenance()
+    compared = [("machine", name) for name in now["machine"]]
+    compared += [("versions", name) for name in COMPUTING]
+    pairs = {name: (last[part][name], now[part][name]) for part, name in compared}
+    differ = [
+        f"{name} {was} before, {here} here" for name, (was, here) in pairs.items() if was != here
+    ]
+    if not differ:
+        return ""
+    return f"results may differ from those of an uninterrupted run: {', '.join(differ)}"
+
+
 def _command() -> str:
     """Return the command that this process is, as it is typed; ``python -m midway.cli`` too."""
     program = Path(sys.argv[0])
