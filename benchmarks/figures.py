@@ -74,9 +74,9 @@ FIGURES = {
     "push-state-distances": Source(
         ("push-state/*",), "push-state-distances", "benchmarks/figures/push-state-distances.png"
     ),
-    "push": Source(("push/*",), "push-learning-curves", "benchmarks/figures/push.png"),
+    "push": Source(("push/*", "push-f32/*"), "push-learning-curves", "benchmarks/figures/push.png"),
     "push-distances": Source(
-        ("push/*",), "push-distances", "benchmarks/figures/push-distances.png"
+        ("push/*", "push-f32/*"), "push-distances", "benchmarks/figures/push-distances.png"
     ),
     "push-images": Source(
         ("push-ris-seed0",), "push-ris-images", "benchmarks/figures/push-images.png", True

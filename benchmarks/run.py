@@ -44,6 +44,7 @@ SUITES: dict[str, list[Job]] = {
     ],
     "push-state": [Job("push-state", agent, 0) for agent in ("ris", "sac")],
     "push": [Job("push", "ris", 0)],
+    "push-f32": [Job("push", "ris", 0, F32)],
     "precision": [Job("point-u", "ris", seed, F32, "f32") for seed in SEEDS],
     "ant-u-fast": [
         *(Job("ant-u", "ris", seed) for seed in range(3)),
