@@ -27,7 +27,7 @@ F32 = ("--precision", "f32")
 BF16 = ("--precision", "bf16")
 ROBOTICS = {
     "PandaReach-v3": 12_000,
-    "PointMaze_UMaze-v3": 16_000,
+    "PointMaze_UMaze-v3": 32_000,
     "PointMaze_Medium-v3": 40_000,
     "FetchReach-v4": 12_000,
 }
