@@ -59,7 +59,7 @@ def title_after_loading(page: Path, profile: Path, width: int) -> str:
 def test_the_page_opens_in_a_browser(ris_run, tmp_path, width):
     page, *_ = report([ris_run], tmp_path / "out")
     title = title_after_loading(page, tmp_path / "profile", width)
-    assert title == "images 6 loaded 6 fetched 0 wide 0"
+    assert title == "images 7 loaded 7 fetched 0 wide 0"
 
 
 @needs_browser
