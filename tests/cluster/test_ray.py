@@ -29,11 +29,11 @@ TINY = {
     "num_envs": 4,
     "random_steps": 16,
     "replay_capacity": 2_000,
-    "evaluate_every": 2_000,
+    "evaluate_every": 1_000,
     "evaluation_episodes": 2,
     "log_every": 500,
-    "checkpoint_every": 200,
-    "steps": 6_000,
+    "checkpoint_every": 100,
+    "steps": 2_000,
 }
 
 

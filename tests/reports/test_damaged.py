@@ -77,7 +77,9 @@ def test_damaged_tables_are_not_read_in_part(run: Path, damage) -> None:
 
 def test_a_last_line_that_is_being_written_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
-    path.write_text("step,loss\n1,2\n2,")
+    path.write_text("step,loss\n1,2\n2,3")
+    assert tables.read(path)["step"].tolist() == [1]
+    path.write_text("step,loss\n1,2\n2,\n")
     assert tables.read(path)["step"].tolist() == [1, 2]
     path.write_text("step,loss\n1,2\n2")
     assert tables.read(path)["step"].tolist() == [1]

@@ -22,7 +22,7 @@ def test_a_run_is_read(ris_run):
     assert run.name == "point-u-ris-seed0"
     assert run.record["versions"]["midway"]
     hard = run.evaluated("hard", "mean")
-    assert hard["step"].tolist() == [400, 800, 1200]
+    assert hard["step"].tolist() == [0, 400, 800, 1200]
 
 
 def test_a_line_that_is_being_written_is_left_out(tmp_path):

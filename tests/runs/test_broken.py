@@ -28,6 +28,10 @@ TINY: dict[str, object] = {
 }
 
 
+EVALUATED = 21
+"""Steps that making the environments and evaluating the policy at step 0 take."""
+
+
 class Line(gymnasium.Env[Any, Any]):
     """A point on a line, which breaks between these steps of all of its kind."""
 
@@ -73,7 +77,7 @@ def test_a_broken_environment_stops_the_run_by_name(
 ) -> None:
     env = midway.goal_env(Line, max_episode_steps=20, success_distance=0.2)
     monkeypatch.setattr(Line, "how", how)
-    monkeypatch.setattr(Line, "breaks_after", Line.taken + 51)
+    monkeypatch.setattr(Line, "breaks_after", Line.taken + 51 + EVALUATED)
     with pytest.raises(BrokenEnvironmentError) as error:
         midway.train(env, agent="sac", out=tmp_path / "run", changes=TINY)
     text = str(error.value)

@@ -132,8 +132,9 @@ class Workers:
             raise self._lost(silent, f"no answer in {self.limit:g} s") from error
         except (EOFError, ConnectionError) as error:
             processes = self._vector.processes
-            multiprocessing.connection.wait([p.sentinel for p in processes], PATIENCE)
-            ended = [not process.is_alive() for process in processes]
+            # One that has just ended may still count as alive; its sentinel says that it has ended.
+            gone = multiprocessing.connection.wait([p.sentinel for p in processes], PATIENCE)
+            ended = [process.sentinel in gone for process in processes]
             reason = "a process that steps environments has ended (killed, or out of memory?)"
             raise self._lost(ended, reason) from error
 

@@ -153,13 +153,13 @@ class Collector:
 
     def _begin(self, replay: ReplayState) -> ReplayState:
         """Begin the episodes of ``begun``; where that fails, a resumed run begins all anew."""
-        while self.fault is None:
+        while True:
             try:
                 self.observation, _ = self.env.reset(options={"reset_mask": self.begun})
                 return step.begin(replay, self.observation, self.begun)
             except BrokenEnvironmentError as error:
-                self._goes_on(error)
-        return replay
+                if not self._goes_on(error):
+                    return replay
 
     def take_metrics(self) -> dict[str, float]:
         """Return means since the last call, NaN where there are none; then start anew."""
