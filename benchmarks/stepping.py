@@ -26,7 +26,7 @@ PACKAGES = (gymnasium_robotics, panda_gym)
 
 ENVIRONMENTS = ("PandaReach-v3", "PointMaze_UMaze-v3", "PointMaze_Medium-v3", "FetchReach-v4")
 NUM_ENVS = 16
-ROUNDS = 15
+ROUNDS = 9
 STEPS = 60
 """Steps of all environments in a round."""
 
