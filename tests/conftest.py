@@ -31,6 +31,12 @@ MAY_SKIP = "MIDWAY_TESTS_MAY_SKIP"
 MUCH = 1_000_000_000
 """Bytes in memory that a worker lets go of its compiled programs at, before the next test."""
 
+A_LITTLE = 100_000_000
+"""Bytes that it must have gained since it last did: what stays is not searched again and again."""
+
+kept = [0]
+"""Bytes in memory after programs were let go of."""
+
 LONGEST = (
     "training/test_resume.py",
     "reports/test_report.py",
@@ -61,6 +67,15 @@ def compiled_programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def short_episodes() -> Iterator[None]:
+    """End the episodes of midway's environments after a few steps, in this process."""
+    import short  # Not before the session is set up: types are checked of what is imported later.
+
+    with short.episodes():
+        yield
+
+
 @pytest.fixture(scope="module", autouse=True)
 def memory_of_one_file(compiled_programs: Path) -> Iterator[None]:
     """Let go of a file's compiled programs when it is through: they would pile up to GiBs."""
@@ -72,9 +87,14 @@ def memory_of_one_file(compiled_programs: Path) -> Iterator[None]:
 def memory_of_one_test() -> Iterator[None]:
     """Let go of compiled programs inside a file as well, where it has become much."""
     yield
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    if pages * resource.getpagesize() > MUCH:
+    if resident() > max(MUCH, kept[-1] + A_LITTLE):
         let_go()
+
+
+def resident() -> int:
+    """Return the bytes that this process has in memory."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize()
 
 
 def let_go() -> None:
@@ -82,6 +102,7 @@ def let_go() -> None:
     jax.clear_caches()
     gc.collect()
     give_back_memory()
+    kept[:] = [resident()]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

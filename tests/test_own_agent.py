@@ -10,8 +10,11 @@ from pathlib import Path
 import pytest
 
 import midway
+import short
 from midway.agents import registry
 from midway.errors import ConfigurationError
+
+pytestmark = pytest.mark.usefixtures("short_episodes")
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SMALL = {
@@ -30,7 +33,7 @@ SMALL = {
 def cli(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run the command line in a process of its own that finds the example."""
     environment = {**os.environ, "PYTHONPATH": str(EXAMPLES)}
-    command = [sys.executable, "-m", "midway.cli", *arguments]
+    command = [sys.executable, short.__file__, *arguments]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 

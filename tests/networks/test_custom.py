@@ -16,6 +16,8 @@ from midway.errors import ConfigurationError
 from midway.networks.custom import create
 from midway.networks.mlp import Linear
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
+
 TINY = {
     "batch_size": 8,
     "num_envs": 4,

@@ -19,6 +19,8 @@ from midway.training import loop, seeds
 from midway.training.evaluate import Episode, Evaluation
 from midway.training.state import Training
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
+
 TINY: dict[str, object] = {
     "hidden": (8,),
     "batch_size": 8,
@@ -51,7 +53,7 @@ def train(out: Path) -> api.Run:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(tmp_path_factory: pytest.TempPathFactory, short_episodes: None) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "run_episodes", lucky)
         return train(tmp_path_factory.mktemp("whole") / "run").path

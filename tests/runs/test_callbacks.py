@@ -18,6 +18,8 @@ from midway.runs.folder import RunFolder
 from midway.training import loop
 from midway.training.evaluate import Episode, Evaluation
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
+
 TINY = {
     "hidden": (8,),
     "batch_size": 8,
@@ -37,7 +39,7 @@ def train(path: Path, **options: Any) -> Run:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(tmp_path_factory: pytest.TempPathFactory, short_episodes: None) -> Path:
     return train(tmp_path_factory.mktemp("whole") / "run").path
 
 

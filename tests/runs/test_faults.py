@@ -22,6 +22,8 @@ from midway.training.checkpoint import steps_in
 from midway.training.events import Events
 from midway.training.state import Training
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
+
 TINY: dict[str, object] = {
     "hidden": (8,),
     "batch_size": 8,
@@ -42,7 +44,7 @@ def command(out: Path) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(tmp_path_factory: pytest.TempPathFactory, short_episodes: None) -> Path:
     path = tmp_path_factory.mktemp("whole") / "run"
     return midway.train("point-u", agent="sac", out=path, changes=TINY).path
 

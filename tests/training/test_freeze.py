@@ -27,6 +27,8 @@ from midway.training.checkpoint import Checkpoints
 from midway.training.config import TrainConfig
 from midway.training.state import Training
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
+
 FROZEN = SMALL | {"encoder_batch_size": 0, "precision": "f32", "freeze_encoder_after": 10}
 
 

@@ -16,6 +16,8 @@ from midway.replay import buffer
 from midway.training import loop
 from midway.training.state import Training
 
+pytestmark = pytest.mark.usefixtures("short_episodes")
+
 IMAGES = SMALL | {"encoder_batch_size": 4}
 
 

@@ -2,7 +2,6 @@
 
 import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 from midway import api
-from midway.envs.registry import ENVIRONMENTS, make_vec
+from midway.envs.registry import make_vec
 from midway.reports.runs import read
 from midway.runs.folder import RunFolder
 from midway.training import loop, state
@@ -30,14 +29,6 @@ TINY = {
 ON_ITS_BACK = (0.0, 1.0, 0.0, 0.0)
 ON_ITS_SIDE = (np.cos(0.77), np.sin(0.77), 0.0, 0.0)
 """A roll of 88 degrees."""
-
-
-@pytest.fixture
-def short_ant(monkeypatch: pytest.MonkeyPatch) -> None:
-    """End the ant's episodes early: what is logged does not depend on their length."""
-    declared = ENVIRONMENTS["ant-u"]
-    arguments = {**declared.arguments, "max_episode_steps": 30}
-    monkeypatch.setitem(ENVIRONMENTS, "ant-u", replace(declared, arguments=arguments))
 
 
 def overturned(num_envs: int, quaternions: dict[int, tuple[float, ...]]) -> Any:
@@ -67,7 +58,9 @@ def test_the_share_of_steps_on_its_back_is_logged_and_begins_anew() -> None:
     assert np.isnan(training.collector.take_metrics()["collect/flip_rate"])
 
 
-def test_flips_are_a_column_of_ants_and_of_nothing_else(tmp_path: Path, short_ant: None) -> None:
+def test_flips_are_a_column_of_ants_and_of_nothing_else(
+    tmp_path: Path, short_episodes: None
+) -> None:
     columns = {}
     for env in ("ant-u", "point-u"):
         run = api.train(env, agent="sac", steps=80, out=tmp_path / env, changes=TINY).path
@@ -80,7 +73,7 @@ def test_flips_are_a_column_of_ants_and_of_nothing_else(tmp_path: Path, short_an
 
 
 def test_checkpoints_from_before_flips_were_counted_can_be_continued(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_ant: None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_episodes: None
 ) -> None:
     env_class = type(make_vec("ant-u"))
     with monkeypatch.context() as before:

@@ -44,7 +44,7 @@ TDM = {name: value for name, value in TINY.items() if name in vars(tdm.Config())
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory: pytest.TempPathFactory, short_episodes: None) -> Path:
     path = tmp_path_factory.mktemp("leap") / "run"
     assert midway.train("point-u", agent="leap", seed=5, out=path, changes=TINY).finished
     return path

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import midway
+import short
 from midway import api
 from midway.errors import ConfigurationError, NonFiniteError
 from midway.runs.folder import RunFolder
@@ -57,7 +58,9 @@ def assert_same_run(first: Path, second: Path) -> None:
 
 
 @pytest.fixture(scope="module", params=["ris", "sac"])
-def whole_run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole_run(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, short_episodes: None
+) -> Path:
     path = tmp_path_factory.mktemp("whole") / request.param
     run = midway.train("point-u", agent=request.param, seed=3, out=path, changes=SMALL)
     assert run.finished
@@ -130,7 +133,7 @@ def start(arguments: list[str]) -> subprocess.Popen[bytes]:
     run = Path(arguments[arguments.index("--out") + 1] if "--out" in arguments else arguments[1])
     with (run / "log").open("w") if run.exists() else open(os.devnull, "w") as target:
         return subprocess.Popen(
-            [sys.executable, "-m", "midway.cli", *arguments],
+            [sys.executable, short.__file__, *arguments],
             stderr=target,
             stdout=subprocess.DEVNULL,
         )
@@ -165,7 +168,7 @@ def test_updates_keep_their_ratio_exactly(whole_run: Path) -> None:
 
 
 def test_non_finite_loss_stops_the_run_and_keeps_the_last_good_checkpoint(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_episodes: None
 ) -> None:
     metrics = loop.metrics
 
