@@ -1,6 +1,8 @@
 """Environments of known packages: success is what they say themselves, in a loop without midway."""
 
 import importlib
+import json
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -9,6 +11,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.seeding import np_random
 
+import midway
+from midway.cli.main import main
 from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, describe
 from midway.envs.success import AskedRule, DistanceRule
 from midway.errors import ConfigurationError
@@ -16,6 +20,17 @@ from midway.errors import ConfigurationError
 pytestmark = pytest.mark.filterwarnings("ignore")
 
 EPISODES = 3
+TINY = {
+    "hidden": (8,),
+    "batch_size": 8,
+    "num_envs": 2,
+    "random_steps": 20,
+    "replay_capacity": 2_000,
+    "evaluate_every": 60,
+    "evaluation_episodes": 1,
+    "log_every": 20,
+    "checkpoint_every": 60,
+}
 CASES = {
     # id: (package, limit, gain of the push towards the goal, distance that is success)
     "PointMaze_UMaze-v3": ("gymnasium_robotics", 150, 5.0, 0.45),
@@ -131,3 +146,20 @@ def test_parking_says_what_to_give() -> None:
     pytest.importorskip("highway_env")
     with pytest.raises(ConfigurationError, match="give --max-episode-steps N"):
         describe("parking-v0")
+
+
+@pytest.mark.parametrize("gym_id", ["PointMaze_UMaze-v3", "FetchReach-v4", "parking-v0"])
+def test_a_run_made_from_python_goes_on_from_the_command_line(
+    gym_id: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Success is never claimed away from the goal, and no episode ends before it has begun."""
+    foreign, radius = described(gym_id), CASES[gym_id][3]
+    env = midway.goal_env(gym_id, max_episode_steps=foreign.spec.max_episode_steps)
+    run = midway.train(env, agent="sac", steps=60, out=tmp_path / "run", changes=TINY).path
+    main(["resume", str(run), "--steps", "120"])
+    capsys.readouterr()
+    main(["evaluate", str(run), "--episodes", "4", "--json"])
+    for episode in json.loads(capsys.readouterr().out)["episodes"]:
+        assert episode["success"] or episode["length"] > 1
+        if radius is not None:
+            assert episode["success"] == (episode["final_distance"] < radius)
