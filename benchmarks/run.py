@@ -32,6 +32,18 @@ ROBOTICS = {
     "FetchReach-v4": 12_000,
 }
 """Environment steps on the environments of others; 50 episodes an evaluation take their time."""
+WITHOUT = {
+    "n-step": ("n_step=1",),
+    "goal-inputs": ("goal_inputs=whole", "normalise=False"),
+    "candidates": ("candidates_per_pair=1",),
+    "hindsight-bound": ("hindsight_bound=False",),
+    "unreached-goals": ("unreached_goals=False",),
+    "single-critic": ("num_critics=2",),
+    "collect-limit": ("collect_limit=0",),
+    "layer-norm": ("layer_norm=False",),
+}
+"""What ``quick`` adds on the ant, and the settings that take it away."""
+
 SUITES: dict[str, list[Job]] = {
     "point-mazes": [
         Job(env, agent, seed, BF16)
@@ -49,6 +61,10 @@ SUITES: dict[str, list[Job]] = {
     "ant-u-fast": [
         *(Job("ant-u", "ris", seed) for seed in range(3)),
         Job("ant-u", "sac", 0),
+    ],
+    "ant-u-ablations": [
+        Job("ant-u", "ris", 0, ("--set", "steps=128000", *settings), f"without-{name}")
+        for name, settings in WITHOUT.items()
     ],
     "ant-u": [Job("ant-u", agent, 0, BF16) for agent in ("ris", "sac", "leap")],
     "robotics": [

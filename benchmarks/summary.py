@@ -1,4 +1,4 @@
-"""Print a table of the results of a suite, one row for each environment and agent.
+"""Print a table of the results of a suite, one row for each environment, agent and variant of it.
 
     python benchmarks/summary.py benchmarks/results/point-mazes
 
@@ -28,7 +28,8 @@ def main() -> None:
         config = json.loads((folder / "config.json").read_text())
         with (folder / "evaluation.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))
-        key = config["env"], config["agent"], config["hyperparameters"]["precision"]
+        name = folder.name.removeprefix(config["env"] + "-").rpartition("-seed")[0]
+        key = config["env"], name, config["hyperparameters"]["precision"]
         groups[key].append(rows)
     columns = [("hard", "mean"), ("hard", "sampled"), ("uniform", "mean")]
     columns = [

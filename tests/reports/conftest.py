@@ -1,12 +1,14 @@
 """Run folders to draw: two tiny ones that are trained once, copies of them, and untrained arms."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 from untrained import save_untrained
 
 from midway import api
@@ -34,8 +36,22 @@ EVALUATED = (
 EVALUATED += ",episode_length,final_distance_hand,final_distance_puck"
 
 
-def train(out: Path, agent: str) -> Path:
-    return api.train("point-u", agent=agent, steps=1_200, out=out, changes=TINY).path
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Return a function that trains an agent once for all workers, and copies its run."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "trained"
+
+    def train(agent: str) -> Path:
+        folder.mkdir(exist_ok=True)
+        with FileLock(folder / f"{agent}.lock"):
+            if not (run := folder / agent).exists():
+                unfinished = folder / f"{agent}.unfinished"
+                api.train("point-u", agent=agent, steps=1_200, out=unfinished, changes=TINY)
+                unfinished.rename(run)
+        return shutil.copytree(run, tmp_path_factory.mktemp("runs") / agent)
+
+    return train
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -47,13 +63,13 @@ def few_episodes() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def ris_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(tmp_path_factory.mktemp("runs") / "ris", "ris")
+def ris_run(trained: Callable[[str], Path]) -> Path:
+    return trained("ris")
 
 
 @pytest.fixture(scope="session")
-def sac_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(tmp_path_factory.mktemp("runs") / "sac", "sac")
+def sac_run(trained: Callable[[str], Path]) -> Path:
+    return trained("sac")
 
 
 @pytest.fixture

