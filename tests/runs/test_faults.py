@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -171,6 +172,34 @@ def test_signals_end_a_run_with_a_checkpoint_and_their_status(
     assert max(steps_in(run / "checkpoints")) == 72
     assert midway.resume(run).finished
     assert_same_run(whole, run)
+
+
+def test_a_step_that_does_not_return_ends_the_run_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, over, said = tmp_path / "run", threading.Event(), []
+
+    def leave(number: int, last_line: Callable[[], str]) -> None:
+        said.append((number, last_line()))
+        over.set()
+        raise SystemExit  # of the thread that watches
+
+    def block(env: Any) -> None:
+        saving = run / "checkpoints" / "68.new"
+        saving.mkdir()
+        signal.raise_signal(signal.SIGTERM)
+        assert not over.wait(0.3)  # a checkpoint that is being written is waited for
+        saving.rmdir()
+        over.wait()
+
+    monkeypatch.setattr(signals, "GRACE", 0.1)
+    monkeypatch.setattr(signals, "_leave", leave)
+    at_step(monkeypatch, 64, block)
+    with pytest.raises(SystemExit) as stop:
+        main(command(run))
+    assert stop.value.code == 128 + signal.SIGTERM
+    goes_on = f"go on from the checkpoint of step 40: midway resume {run}"
+    assert said == [(signal.SIGTERM, f"interrupted in the middle of a step; {goes_on}")]
 
 
 @pytest.mark.parametrize("step", [60, 120])
