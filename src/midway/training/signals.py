@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from types import FrameType
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 from midway.training.terminal import print_line, show_cursor
 
@@ -161,6 +161,7 @@ class _Watch(NamedTuple):
             if not select.select([reading], [], [], left)[0]:
                 if not saving():
                     _leave(first, self.last_line)
+                    return
                 deadline = time.monotonic() + self.grace
                 continue
             number = os.read(reading, 1)[0]
@@ -180,22 +181,20 @@ def _watched(watch: _Watch) -> Iterator[None]:
         return
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
-
-    def wait() -> None:
-        watch.wait(reading)
-        os.close(reading)
-        os.close(writing)
-
-    threading.Thread(target=wait, daemon=True).start()
+    thread = threading.Thread(target=watch.wait, args=(reading,), daemon=True)
+    thread.start()
     descriptor = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     try:
         yield
     finally:
         signal.set_wakeup_fd(descriptor)
         os.write(writing, b"\0")
+        thread.join()
+        os.close(reading)
+        os.close(writing)
 
 
-def _leave(number: int, last_line: Callable[[], str]) -> NoReturn:
+def _leave(number: int, last_line: Callable[[], str]) -> None:
     """End this process by a signal, and those that step environments."""
     try:
         print_line(f"midway: {last_line()}")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from midway.agent import AgentState, AnyAgent, Encoder, Memory
@@ -326,8 +327,9 @@ def load_state_dict(training: Training, state: Stored) -> None:
     training.arrays = with_named_arrays(training.arrays, state["agent"])
     training.memory = with_named_arrays(training.memory, state.get("memory", {}))
     training.totals = state["totals"]
-    # Checkpoints of earlier versions have no `written`: nothing was withdrawn then.
-    stored = {"written": state["replay"].get("num_rows"), **state["replay"]}
+    stored = state["replay"]
+    if "written" not in stored:  # in an earlier version, where nothing was withdrawn
+        stored = {**stored, "written": jnp.copy(stored["num_rows"])}
     replay = with_named_arrays(training.replay, stored)
     training.collector, training.replay = Collector.restore(
         training.collector.env, replay, state["collector"]
