@@ -16,7 +16,7 @@ class BrokenEnvironmentError(RuntimeError):
     """An environment raised or shows what cannot be used; its text names copy and step.
 
     Attributes:
-        copies: The copies that broke.
+        copies: The copies that broke; after a reset, those that have no episode.
         step: What the step gave all the same, whose info ``broken`` tells which copies have no part
             in it; None where it was not taken.
     """

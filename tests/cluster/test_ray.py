@@ -27,15 +27,19 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore"),
 ]
 
-SOON = {
+SETTINGS = {
     "health_check_initial_delay_ms": 0,
     "health_check_period_ms": 500,
     "health_check_failure_threshold": 3,
     "health_check_timeout_ms": 60_000,
     "enable_worker_prestart": False,
     "prestart_worker_first_driver": False,
+    "worker_niceness": 0,
 }
-"""A node that is gone is found out in two seconds; one that is slow is none that is gone."""
+"""A node that is gone is found out in two seconds; one that is slow is none that is gone.
+
+Workers are as nice as other processes: on a busy machine they would get nothing.
+"""
 
 STAND_IN = """
 import os, pathlib, shutil, sys, time
@@ -79,7 +83,7 @@ def cluster(home: Path) -> Iterator[Any]:
     import ray
     from ray.cluster_utils import Cluster
 
-    head = {"num_cpus": 1, "include_dashboard": False, "_system_config": SOON}
+    head = {"num_cpus": 1, "include_dashboard": False, "_system_config": SETTINGS}
     started = Cluster(initialize_head=True, head_node_args=head)
     yield started
     ray.shutdown()

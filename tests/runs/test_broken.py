@@ -12,10 +12,12 @@ import pytest
 from gymnasium import spaces
 
 import midway
+from midway.envs.registry import make_vec
 from midway.errors import BrokenEnvironmentError
-from midway.replay.buffer import num_transitions
+from midway.replay.buffer import create, num_transitions
 from midway.training import loop
 from midway.training.checkpoint import steps_in
+from midway.training.collect import Collector
 from midway.training.state import Training
 
 TINY: dict[str, object] = {
@@ -132,3 +134,25 @@ def test_an_environment_that_always_breaks_stops_the_run_after_all(
     monkeypatch.setattr(Line, "breaks_after", Line.taken + 31)
     with pytest.raises(BrokenEnvironmentError, match="simulator is tired"):
         midway.train(env, agent="sac", out=tmp_path, changes=TINY, on_env_error="restart")
+
+
+def test_where_a_reset_ends_all_episodes_all_begin_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one that hangs in a process of its own does."""
+    env = make_vec("point-u", 2)
+    replay = create(env.goal_spec, 1_000, 2)
+    collector, replay = Collector.start(env, replay, seed=0, restarts=True)
+    replay = collector.step(replay, lambda observation: np.zeros((2, 2), np.float32))
+    with monkeypatch.context() as patch:
+
+        def once(**given: Any) -> Any:
+            patch.undo()
+            lost = BrokenEnvironmentError("no answer")
+            lost.copies = range(2)
+            raise lost
+
+        patch.setattr(env, "reset", once)
+        collector.begun = np.array([True, False])
+        replay = collector._begin(replay)
+    assert collector.begun.all()
+    assert np.asarray(replay.num_episodes).tolist() == [2, 2]
+    assert collector.counts.restarts == 1

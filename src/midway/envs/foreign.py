@@ -410,7 +410,7 @@ class ForeignVectorEnv(GoalVectorEnv):
             except LostError as lost:
                 self._ended[:] = True
                 error = self._named(lost.copies[0], actions, str(lost))
-                error.copies = lost.copies
+                error.copies = range(self.num_envs) if actions is None else lost.copies
                 raise error from lost
         else:
             assert self._group is not None

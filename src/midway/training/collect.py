@@ -114,8 +114,7 @@ class Collector:
         except BrokenEnvironmentError as error:
             if not self._goes_on(error) or error.step is None:
                 self.moved, self.begun = False, np.full(self.env.num_envs, self.fault is None)
-                broken = np.isin(np.arange(self.env.num_envs), error.copies)
-                replay = step.withdraw(replay, broken)
+                replay = step.withdraw(replay, self._mask(error))
                 return self._begin(replay) if self.fault is None else replay
             taken = cast(Step, error.step)
         return self._store(replay, actions, taken)
@@ -167,6 +166,11 @@ class Collector:
             except BrokenEnvironmentError as error:
                 if not self._goes_on(error):
                     return replay
+                self.begun = self.begun | self._mask(error)
+
+    def _mask(self, error: BrokenEnvironmentError) -> NumPyArray:
+        """Return which environments an error is about."""
+        return np.isin(np.arange(self.env.num_envs), error.copies)
 
     def take_metrics(self) -> dict[str, float]:
         """Return means since the last call, NaN where there are none; then start anew."""
