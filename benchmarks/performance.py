@@ -10,21 +10,27 @@ Markdown.
 import argparse
 import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 
+from midway import files
 from midway.agents import ris
 from midway.bench import pieces as measures
 from midway.bench import plan as bench_plan
 from midway.replay import buffer
+from midway.training import state
+from midway.training.checkpoint import Checkpoints
 
 RESULTS = Path(__file__).parent / "results" / "speed" / "midway.json"
 ONE_CORE = ("taskset", "--cpu-list", "0")
@@ -85,7 +91,7 @@ def memory(env: str) -> dict[str, Any]:
 def split(batch: int) -> dict[str, Any]:
     """Return how long the parts of one update of RIS take, each compiled alone (ms)."""
     training = measures.filled("ant-u", "ris", batch, "bf16", updates_per_call=1)
-    state, spec, mix = training.state, training.program.spec, training.setup.train.relabel
+    agent, spec, mix = training.state, training.program.spec, training.setup.train.relabel
     key = jax.random.key(0)
     sample = jax.jit(lambda replay: buffer.sample(replay, spec, mix, batch, key))
     drawn = sample(training.replay)
@@ -96,10 +102,10 @@ def split(batch: int) -> dict[str, Any]:
     times = measures.medians(
         {
             "sample": lambda: sample(training.replay),
-            "critics": lambda: arrays(critics(state, drawn.observation, drawn, key)),
-            "subgoal_policy": lambda: arrays(subgoal_policy(state, drawn)),
-            "policy": lambda: arrays(policy(state, drawn, key, key)),
-            "targets": lambda: arrays(targets(state)),
+            "critics": lambda: arrays(critics(agent, drawn.observation, drawn, key)),
+            "subgoal_policy": lambda: arrays(subgoal_policy(agent, drawn)),
+            "policy": lambda: arrays(policy(agent, drawn, key, key)),
+            "targets": lambda: arrays(targets(agent)),
         }
     )
     return {"batch": batch, **times}
@@ -150,6 +156,42 @@ def first_update(env: str, cache: str) -> float:
     return round(seconds, 2)
 
 
+def checkpoint(transitions: int) -> dict[str, Any]:
+    """Return the processor time of a checkpoint of the ant, and of the checksums in it.
+
+    The replay is full of noise, which cannot be compressed.
+    """
+    training = measures.filled(
+        "ant-u", "sac", 256, "f32", 1, random_steps=16, replay_capacity=transitions
+    )
+    key = jax.random.key(0)
+    rows = {name: jax.random.normal(key, x.shape) for name, x in training.replay.rows.items()}
+    stored = state.state_dict(replace(training, replay=training.replay._replace(rows=rows)))
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoints = Checkpoints(Path(folder))
+        seconds = [processor_time(partial(checkpoints.save, step, stored)) for step in range(5)]
+        written = [path for path in Path(folder, "4").rglob("*") if path.is_file()]
+        size = sum(path.stat().st_size for path in written)
+        checksums = processor_time(lambda: [files.checksum(path) for path in written])
+        resuming = processor_time(partial(checkpoints.verify, 4))
+    whole = statistics.median(seconds)
+    return {
+        "transitions": transitions,
+        "mb": round(size / 1e6, 1),
+        "save_s": round(whole, 3),
+        "checksums_s": round(checksums, 3),
+        "share_of_save": f"{checksums / whole:.0%}",
+        "verify_s": round(resuming, 3),
+    }
+
+
+def processor_time(action: Callable[[], object]) -> float:
+    """Return the processor time of an action in all threads (s)."""
+    started = time.process_time()
+    action()
+    return time.process_time() - started
+
+
 def table(rows: list[dict[str, Any]]) -> None:
     """Print rows as a table."""
     print("| " + " | ".join(rows[0]) + " |")
@@ -172,6 +214,7 @@ PARTS: dict[str, Callable[[], list[dict[str, Any]]]] = {
     "memory": lambda: [memory(env) for env in ("ant-u", "push")],
     "start": starts,
     "plan": plans,
+    "checkpoint": lambda: [checkpoint(count) for count in (100_000, 1_000_000)],
 }
 
 

@@ -22,7 +22,7 @@ from midway.runs.provenance import changed_here
 from midway.runs.sinks import RunSinks
 from midway.settings import changed
 from midway.training import loop, seeds, signals, state
-from midway.training.checkpoint import Checkpoints, steps_in
+from midway.training.checkpoint import Checkpoints
 from midway.training.evaluate import ActionKind, Evaluation, run_episodes
 from midway.training.logging import Logger
 from midway.training.progress import Reporter, Silent, reporter, stages_of
@@ -263,7 +263,7 @@ def _run_locked(
                 finished = False
             return Run(folder.path, finished, None if finished else asked.end)
     except (NonFiniteError, BrokenEnvironmentError) as error:
-        raise type(error)(f"{error}; {_kept(folder)}") from error
+        raise type(error)(f"{error}; {complete.left(folder)}") from error
 
 
 def _run(
@@ -314,11 +314,3 @@ def _complete(training: Training, sinks: RunSinks, folder: RunFolder, asked: sig
     if due and not complete.is_evaluated(folder, steps):
         loop.take_evaluation(training, sinks, {}, asked)
         asked.check()
-
-
-def _kept(folder: RunFolder) -> str:
-    """Return what a run that was stopped can go on from."""
-    newest = max(steps_in(folder.checkpoints), default=None)
-    if newest is None:
-        return "there is no checkpoint yet"
-    return f"go on from the checkpoint of step {newest}: midway resume {folder.path}"

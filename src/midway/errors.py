@@ -1,6 +1,6 @@
 """What the package raises on purpose; the file loads nothing, so that declarations import fast."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 
@@ -16,10 +16,12 @@ class BrokenEnvironmentError(RuntimeError):
     """An environment raised or shows what cannot be used; its text names copy and step.
 
     Attributes:
+        copies: The copies that broke; after a reset, those that have no episode.
         step: What the step gave all the same, whose info ``broken`` tells which copies have no part
             in it; None where it was not taken.
     """
 
+    copies: Sequence[int] = ()
     step: object = None
 
 

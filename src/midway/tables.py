@@ -92,14 +92,29 @@ class Appender:
             OSError: It cannot be written; a part of it may be there.
         """
         if self._columns is None:
-            self._columns = list(row)
-            _replace(self._path, [self._columns])
-        values = [row.get(column, "") for column in self._columns]
+            _replace(self._path, [self._columns_of(row)])
+        values = [row.get(column, "") for column in self._columns_of(row)]
         try:
             with self._path.open("a", newline="") as file:
                 csv.writer(file).writerow(values)
         except OSError as error:
             raise files.named(error, self._path) from error
+
+    def write_together(self, rows: Sequence[Mapping[str, object]]) -> None:
+        """Append rows that are there all or none; the whole file is written for them.
+
+        Raises:
+            OSError: They cannot be written; none of them is there.
+        """
+        columns = self._columns_of(rows[0])
+        before = _rows(self._path) if self._path.exists() else [columns]
+        values = [[row.get(column, "") for column in columns] for row in rows]
+        _replace(self._path, [*before, *values])
+
+    def _columns_of(self, row: Mapping[str, object]) -> list[str]:
+        """Return the columns, which the first row decides."""
+        self._columns = self._columns or list(row)
+        return self._columns
 
     def _truncate(self, until: int) -> None:
         try:

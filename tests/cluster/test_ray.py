@@ -1,20 +1,24 @@
-"""A sweep on a local Ray cluster of several nodes, one of which is killed in the middle."""
+"""A sweep on a local Ray cluster whose driver, a worker and a node are killed one by one."""
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-import midway
+from midway import tables
 from midway.cluster import sweep
-from midway.cluster.jobs import finished
+from midway.configuration import configure
 from midway.errors import ConfigurationError
+from midway.runs.folder import RunFolder, write_json
+from midway.training.arrays import save_arrays
 
 pytestmark = [
     pytest.mark.extra,
@@ -23,27 +27,64 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore"),
 ]
 
-TINY = {
-    "hidden": (8,),
-    "batch_size": 8,
-    "num_envs": 4,
-    "random_steps": 16,
-    "replay_capacity": 2_000,
-    "evaluate_every": 1_000,
-    "evaluation_episodes": 2,
-    "log_every": 500,
-    "checkpoint_every": 100,
-    "steps": 2_000,
+SETTINGS = {
+    "health_check_initial_delay_ms": 0,
+    "health_check_period_ms": 500,
+    "health_check_failure_threshold": 3,
+    "health_check_timeout_ms": 60_000,
+    "enable_worker_prestart": False,
+    "prestart_worker_first_driver": False,
+    "worker_niceness": 0,
 }
+"""A node that is gone is found out in two seconds; one that is slow is none that is gone.
+
+Workers are as nice as other processes: on a busy machine they would get nothing.
+"""
+
+STAND_IN = """
+import os, pathlib, shutil, sys, time
+words, home = sys.orig_argv, pathlib.Path(os.environ["STAND_IN"])
+if words[1:3] == ["-m", "midway.cli"] and words[3] in ("train", "resume"):
+    run = pathlib.Path(words[words.index("--out") + 1] if words[3] == "train" else words[4])
+    seed = run.name[-1]
+    with (home / f"starts{seed}").open("a") as file:
+        file.write(f"{words[3]} {os.getpid()}\\n")
+    if seed == "2":
+        print("midway: its simulator is tired", flush=True)
+        os._exit(1)
+    run.mkdir(exist_ok=True)
+    shutil.copy(home / "whole" / "config.json", run)
+    while not (home / f"go{seed}").exists():
+        time.sleep(0.05)
+    shutil.copytree(home / "whole", run, dirs_exist_ok=True)
+    os._exit(0)
+"""
+"""In the place of `midway train` and `resume`: notes its start, waits, and leaves a whole run."""
 
 
 @pytest.fixture
-def cluster() -> Iterator[Any]:
-    """A head without processors and two nodes with one each."""
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of the stand-ins, which all processes of the cluster start."""
+    (tmp_path / "sitecustomize.py").write_text(STAND_IN)
+    monkeypatch.setenv("STAND_IN", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    whole = RunFolder(tmp_path / "whole")
+    whole.create(configure("point-u", "sac", "quick", 0, {"steps": 40}))
+    (whole.checkpoints / "40").mkdir(parents=True)
+    tables.write(whole.evaluation_file, {"step": np.array([40])})
+    save_arrays(whole.policy_weights, {"weight": np.zeros(1)}, {"step": 40})
+    write_json(whole.policy_config, {"step": 40})
+    return tmp_path
+
+
+@pytest.fixture
+def cluster(home: Path) -> Iterator[Any]:
+    """A head with one processor."""
     import ray
     from ray.cluster_utils import Cluster
 
-    started = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    head = {"num_cpus": 1, "include_dashboard": False, "_system_config": SETTINGS}
+    started = Cluster(initialize_head=True, head_node_args=head)
     yield started
     ray.shutdown()
     started.shutdown()
@@ -55,60 +96,64 @@ def wait_for(condition: Callable[[], Any]) -> None:
         time.sleep(0.02)
 
 
-def processes(folder: Path) -> list[int]:
-    """Return the processes whose command line names the run folder; a zombie has none."""
-    found = []
-    for command in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = command.read_bytes().split(b"\0")
-        except OSError:  # it has ended
-            continue
-        if b"midway.cli" in words and os.fsencode(folder) in words:
-            found.append(int(command.parent.name))
-    return found
+def starts(home: Path, seed: int) -> list[tuple[str, int]]:
+    """Return command and process of each start of a run."""
+    file = home / f"starts{seed}"
+    lines = file.read_text().splitlines() if file.exists() else []
+    return [(line.split()[0], int(line.split()[1])) for line in lines]
 
 
-def stop_at_first_checkpoint(folder: Path) -> int:
-    """Hold the run in the middle, and return its process."""
-    wait_for(lambda: any(path.name.isdecimal() for path in (folder / "checkpoints").glob("*")))
-    (process,) = processes(folder)
-    os.kill(process, signal.SIGSTOP)
-    return process
+def is_running(process: int) -> bool:
+    """Return whether a process has a command line: one that has ended has none."""
+    try:
+        return bool(Path(f"/proc/{process}/cmdline").read_bytes())
+    except OSError:
+        return False
 
 
-def test_runs_of_a_killed_node_are_resumed_on_another(cluster: Any, tmp_path: Path) -> None:
-    """Their results equal those of a run that nothing ever happened to."""
-    nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
-    cluster.wait_for_nodes()
-    options = ["--set", *[f"{name}={value}" for name, value in TINY.items()]]
-    jobs = sweep.jobs(["point-u"], ["sac"], [0, 1], options)
+def parent(process: int) -> int:
+    lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("PPid:")).split()[1])
+
+
+def test_a_sweep_outlives_its_driver_a_worker_and_a_node(cluster: Any, home: Path) -> None:
+    node = cluster.add_node(num_cpus=1)
+    out = home / "sweep"
+    words = [sys.executable, "-m", "midway.cli", "sweep", "point-u", "--agents", "sac"]
+    driver = subprocess.Popen([*words, "--seeds", "0", "--out", out, "--ray", cluster.address])
+    wait_for(lambda: starts(home, 0) or driver.poll() is not None)
+    driver.kill()
+    driver.wait()
+    (first,) = starts(home, 0)
+    wait_for(lambda: not is_running(first[1]))
+
     ended: list[sweep.Status] = []
-    sweeping = threading.Thread(
-        target=lambda: ended.extend(
-            sweep.run(jobs, tmp_path, lambda found: None, ray_address=cluster.address)
-        ),
+    jobs = sweep.jobs(["point-u"], ["sac"], [0, 1, 2])
+    address = cluster.address
+    typed_again = threading.Thread(
+        target=lambda: ended.extend(sweep.run(jobs, out, lambda found: None, ray_address=address)),
         daemon=True,
     )
-    sweeping.start()
-    folders = [tmp_path / job.name for job in jobs]
-    with ThreadPoolExecutor() as threads:
-        stopped = set(threads.map(stop_at_first_checkpoint, folders))
-    assert not any(finished(job, tmp_path) for job in jobs)
-    cluster.remove_node(nodes[0], allow_graceful=False)
-    wait_for(lambda: not all(processes(folder) for folder in folders))
-    (survivor,) = (process for folder in folders for process in processes(folder))
-    assert survivor in stopped
-    os.kill(survivor, signal.SIGCONT)
-    sweeping.join()
-    assert [status.state for status in ended] == ["finished", "finished"]
-    logs = [(tmp_path / f"{job.name}.log").read_text() for job in jobs]
-    assert [log.count("finished") for log in logs] == [1, 1]
-    for seed, folder in enumerate(folders):
-        whole = midway.train(
-            "point-u", agent="sac", seed=seed, out=tmp_path / f"whole{seed}", changes=TINY
-        )
-        weights = [path / "policy.safetensors" for path in (folder, whole.path)]
-        assert weights[0].read_bytes() == weights[1].read_bytes()
+    typed_again.start()
+    wait_for(lambda: (len(starts(home, 0)), len(starts(home, 1))) == (2, 1))
+    raylet = node.all_processes["raylet"][0].process.pid
+    workers = {seed: parent(starts(home, seed)[-1][1]) for seed in (0, 1)}
+    (seed,) = (seed for seed, worker in workers.items() if parent(worker) == raylet)
+
+    before = len(starts(home, seed))
+    os.kill(workers[seed], signal.SIGKILL)
+    wait_for(lambda: len(starts(home, seed)) == before + 1)
+    cluster.remove_node(node, allow_graceful=False)
+    wait_for(lambda: not is_running(starts(home, seed)[-1][1]))
+    (home / f"go{1 - seed}").touch()  # which frees the processor of the head
+    wait_for(lambda: len(starts(home, seed)) == before + 2)
+    (home / f"go{seed}").touch()
+    typed_again.join()
+    assert [status.state for status in ended] == ["finished", "finished", "failed"]
+    assert ended[2].reason == "midway: its simulator is tired"
+    for each in (0, 1):
+        commands = [command for command, _ in starts(home, each)]
+        assert commands == ["train"] + ["resume"] * (len(commands) - 1)
 
 
 def test_a_cluster_that_is_not_there_is_one_clear_line(tmp_path: Path) -> None:

@@ -118,6 +118,8 @@ def test_batch_equals_batches_of_one_at_any_number_of_threads(name):
                 single.reset()[0] if mask[i] else seen
                 for i, (single, seen) in enumerate(zip(singles, apart, strict=True))
             ]
+    states = np.concatenate([single.batch.state for single in singles])
+    np.testing.assert_array_equal(batch.batch.state, states)
 
 
 @every_environment

@@ -47,6 +47,7 @@ BATCH = 2048
 # Compiled once for all tests, and quickly: these tests are about results.
 begin = jax.jit(buffer.begin)
 add = jax.jit(buffer.add)
+withdraw = jax.jit(buffer.withdraw)
 _sample = jax.jit(buffer.sample, static_argnums=(1, 2, 3, 5))
 
 
@@ -89,12 +90,31 @@ class Row:
 
 
 class Reference:
-    """K lists of rows; the last L rows of each list are what a ring of L rows still holds."""
+    """K lists of rows; the last L rows of each list are what a ring of L rows still holds.
+
+    Where rows were withdrawn there are fewer: their places held others before.
+    """
 
     def __init__(self, spec, num_lanes, lane_rows):
         self.spec, self.num_lanes, self.lane_rows = spec, num_lanes, lane_rows
         self.lanes = [[] for _ in range(num_lanes)]
+        self.longest = [0] * num_lanes
         self.counter = 0
+
+    def held(self, lane):
+        """The rows of a lane that no later one has overwritten."""
+        rows = self.lanes[lane]
+        self.longest[lane] = max(self.longest[lane], len(rows))
+        return rows[max(self.longest[lane] - self.lane_rows, 0) :]
+
+    def withdraw(self, mask):
+        """Remove the newest episode where masked, if its goal row is there; return the mask."""
+        for lane in np.flatnonzero(mask):
+            rows, held = self.lanes[lane], self.held(lane)
+            newest = [row for row in held if row.episode == rows[-1].episode]
+            if newest and newest[0].is_goal:
+                del rows[-len(newest) :]
+        return mask
 
     def begin(self, mask):
         """Write goal row and s_0 where masked, and return the observation of the reset."""
@@ -142,8 +162,8 @@ class Reference:
     def episodes(self):
         """The drawable episodes: (goal row, state rows) of those whose goal row is still there."""
         found = {}
-        for lane, rows in enumerate(self.lanes):
-            for row in rows[-self.lane_rows :]:
+        for lane in range(self.num_lanes):
+            for row in self.held(lane):
                 if row.is_goal:
                     found[lane, row.episode] = (row, [])
                 elif (lane, row.episode) in found:

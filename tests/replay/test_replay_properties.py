@@ -2,13 +2,25 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from replay_reference import SIZES, SPECS, VECTOR, Reference, add, begin, contents, names, sample
+from replay_reference import (
+    SIZES,
+    SPECS,
+    VECTOR,
+    Reference,
+    add,
+    begin,
+    contents,
+    names,
+    sample,
+    withdraw,
+)
 
 from midway.replay.buffer import create, num_transitions
 from midway.types import RelabelMix
 
 MIX = RelabelMix()
 COUNTS = (409, 819, 820)
+BEGIN, ADD, WITHDRAW = "begin", "add", "withdraw"
 
 
 def run(spec, size, operations):
@@ -16,12 +28,14 @@ def run(spec, size, operations):
     num_lanes, lane_rows = size
     reference = Reference(spec, num_lanes, lane_rows)
     replay = create(spec, num_lanes * lane_rows, num_lanes)
-    for is_begin, bits in operations:
+    for kind, bits in operations:
         mask = (bits >> np.arange(num_lanes)) % 2 == 1
-        if is_begin:
+        if kind == BEGIN:
             replay = begin(replay, reference.begin(mask), mask)
-        else:
+        elif kind == ADD:
             replay = add(replay, *reference.add(mask), mask)
+        else:
+            replay = withdraw(replay, reference.withdraw(mask))
     return replay, reference
 
 
@@ -76,7 +90,7 @@ def check_rewards(spec, batch, following, goals):
 
 def operations(max_size):
     """Mostly steps, so that episodes of all lengths arise; masks as bits."""
-    kinds = st.sampled_from([True, False, False, False])
+    kinds = st.sampled_from([BEGIN, ADD, ADD, ADD, WITHDRAW, BEGIN])
     return st.lists(st.tuples(kinds, st.integers(0, 7)), min_size=2, max_size=max_size)
 
 
@@ -98,8 +112,8 @@ def test_batch_is_what_was_written(name, size, script, seed):
 @example(lengths=[1] * 39 + [0])  # as many episodes as a lane can hold
 def test_wraps_with_whole_episodes(size, lengths):
     # Full-length use: every lane runs episodes one after the other, the ring wraps several times.
-    script = [op for length in lengths for op in [(True, 7)] + [(False, 7)] * length]
-    replay, reference = run(VECTOR, size, [*script, (False, 7)])
+    script = [op for length in lengths for op in [(BEGIN, 7)] + [(ADD, 7)] * length]
+    replay, reference = run(VECTOR, size, [*script, (ADD, 7)])
     check(VECTOR, reference, sample(replay, VECTOR, MIX, seed=0))
     if sum(lengths) > 2 * size[1]:
         # Two of the longest episodes fit, so one whole episode at least is always drawable.
@@ -109,9 +123,9 @@ def test_wraps_with_whole_episodes(size, lengths):
 def test_every_slot_is_drawn_at_some_time():
     size = num_lanes, lane_rows = SIZES[1]
     generator = np.random.default_rng(0)
-    script, seen = [(True, 7)], set()
+    script, seen = [(BEGIN, 7)], set()
     for _ in range(40):
-        script += [(False, 7)] * generator.integers(1, 5) + [(True, 7)]
+        script += [(ADD, 7)] * generator.integers(1, 5) + [(BEGIN, 7)]
         replay, reference = run(VECTOR, size, script)
         drawn = set(names(sample(replay, VECTOR, MIX, seed=0).observation))
         for lane, rows in enumerate(reference.lanes):
@@ -120,6 +134,18 @@ def test_every_slot_is_drawn_at_some_time():
 
 
 def test_episode_longer_than_its_lane_is_dropped():
-    replay, reference = run(VECTOR, (1, 12), [(True, 1)] + [(False, 1)] * 30)
-    assert reference.transitions() == {}
-    assert int(num_transitions(replay)) == 0
+    script = [(BEGIN, 1)] + [(ADD, 1)] * 30
+    for last in ([], [(WITHDRAW, 1)]):
+        replay, reference = run(VECTOR, (1, 12), script + last)
+        assert reference.transitions() == {}
+        assert int(num_transitions(replay)) == 0
+
+
+def test_withdrawn_episodes_are_drawn_no_more_and_what_they_overwrote_is_gone():
+    episode = [(BEGIN, 7)] + [(ADD, 7)] * 3
+    # The third episode is withdrawn; its last row has overwritten the goal row of the first.
+    script = [*episode, *episode, (BEGIN, 1), (ADD, 1), (WITHDRAW, 1), (BEGIN, 1), (ADD, 1)]
+    for length, transitions in ((-3, 4), (-2, 3), (len(script), 4)):
+        replay, reference = run(VECTOR, SIZES[0], script[:length])
+        assert len(reference.transitions()) == transitions
+        check(VECTOR, reference, sample(replay, VECTOR, MIX, seed=0))

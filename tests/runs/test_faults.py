@@ -3,9 +3,11 @@
 import csv
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,8 +19,12 @@ import midway
 from midway.api import Run
 from midway.cli.main import main
 from midway.errors import BrokenEnvironmentError, NonFiniteObservationError
-from midway.training import loop, signals
+from midway.replay.buffer import num_transitions
+from midway.runs import complete
+from midway.runs.folder import RunFolder
+from midway.training import loop, signals, state
 from midway.training.checkpoint import steps_in
+from midway.training.collect import Collector
 from midway.training.events import Events
 from midway.training.state import Training
 
@@ -170,6 +176,52 @@ def test_signals_end_a_run_with_a_checkpoint_and_their_status(
     assert_same_run(whole, run)
 
 
+def test_a_checkpoint_from_before_episodes_were_withdrawn_goes_on(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored = state.state_dict
+
+    def without_written(training: Training) -> Any:
+        everything = stored(training)
+        del everything["replay"]["written"]
+        return everything
+
+    with monkeypatch.context() as patch:
+        patch.setattr(state, "state_dict", without_written)
+        signal_at(patch, "advance", signal.SIGTERM, lambda t: t.counters.steps == 68)
+        run = train(tmp_path / "run")
+    assert not run.finished
+    assert midway.resume(run.path).finished
+    assert_same_run(whole, run.path)
+
+
+def test_a_step_that_does_not_return_ends_the_run_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, over, said = tmp_path / "run", threading.Event(), []
+
+    def leave(number: int, last_line: Callable[[], str]) -> None:
+        said.append((number, last_line()))
+        over.set()
+
+    def block(env: Any) -> None:
+        saving = run / "checkpoints" / "68.new"
+        saving.mkdir()
+        signal.raise_signal(signal.SIGTERM)
+        assert not over.wait(0.3)  # a checkpoint that is being written is waited for
+        saving.rmdir()
+        over.wait()
+
+    monkeypatch.setattr(signals, "GRACE", 0.1)
+    monkeypatch.setattr(signals, "_leave", leave)
+    at_step(monkeypatch, 64, block)
+    with pytest.raises(SystemExit) as stop:
+        main(command(run))
+    assert stop.value.code == 128 + signal.SIGTERM
+    goes_on = f"go on from the checkpoint of step 40: midway resume {run}"
+    assert said == [(signal.SIGTERM, f"interrupted in the middle of a step; {goes_on}")]
+
+
 @pytest.mark.parametrize("step", [60, 120])
 def test_an_interrupted_evaluation_is_repeated(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
@@ -185,6 +237,33 @@ def test_an_interrupted_evaluation_is_repeated(
     )
     assert midway.resume(run.path).finished
     assert_same_run(whole, run.path)
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+def test_a_process_that_is_killed_while_it_repeats_an_evaluation_is_not_finished(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Path(shutil.copytree(whole, tmp_path / "run"))
+    table = run / "evaluation.csv"
+    lines = table.read_text().splitlines(keepends=True)
+    table.write_text("".join(line for line in lines if not line.startswith("120,")))
+    replace = Path.replace
+
+    def kill(written: Path, name: Path) -> Path:
+        if name == table and "\n120," in written.read_text():
+            raise Killed
+        return replace(written, name)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", kill)
+        with pytest.raises(Killed):
+            midway.resume(run)
+    assert complete.missing(RunFolder(run), 120) == "evaluation of step 120"
+    assert midway.resume(run).finished
+    assert_same_run(whole, run)
 
 
 def test_usr1_writes_a_checkpoint_and_goes_on(
@@ -273,9 +352,22 @@ def test_a_number_that_is_not_finite_never_enters_the_replay(
     assert all(np.isfinite(float(row["critic/loss"])) for row in rows(tmp_path / "run/metrics.csv"))
 
 
-def test_an_episode_whose_simulation_diverges_is_cut_and_counted(
+def test_an_episode_whose_simulation_diverges_is_withdrawn_and_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    stored = [0]
+    take = Collector.step
+
+    def and_count(collector: Collector, replay: Any, choose: Any) -> Any:
+        length, before = int(collector.env._elapsed[2]), collector.counts.diverged
+        replay = take(collector, replay, choose)
+        change = int(num_transitions(replay)) - stored[0]
+        assert change == (3 - length if collector.counts.diverged > before else 4)
+        stored[0] += change
+        return replay
+
+    monkeypatch.setattr(Collector, "step", and_count)
+
     def throw(env: Any) -> None:
         simulate = env._simulate
 

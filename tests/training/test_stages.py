@@ -10,12 +10,17 @@ from midway.training.progress import showing_stages, stage
 
 PROGRAM = """
 import hashlib, os, sys, threading
-from midway.training.signals import ending_soon
-with ending_soon(grace=0.2):
-    threading.Timer(1.0, os.kill, (os.getpid(), int(sys.argv[1]))).start()
+from midway.training import signals
+signals.GRACE = 0.2 if len(sys.argv) == 3 else 1000
+with {context}:
+    for number in sys.argv[2:]:
+        threading.Timer(1.0, os.kill, (os.getpid(), int(number))).start()
     hashlib.pbkdf2_hmac("sha256", b"native", b"code", 10**9)
 """
 """Signals itself once native code runs, which lets Python's other threads run."""
+
+COMMAND = "signals.ending_soon(grace=0.2)"
+RUN = "signals.ending_in_time(), signals.listening()"
 
 
 def test_stages_are_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
@@ -26,9 +31,19 @@ def test_stages_are_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixtu
     assert capsys.readouterr().err == "decoder: 1 of 3\n"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_signal_ends_native_code_too(number: signal.Signals) -> None:
-    command = [sys.executable, "-c", PROGRAM, str(int(number))]
+@pytest.mark.parametrize(
+    ("context", "numbers"),
+    [
+        (COMMAND, [signal.SIGINT]),
+        (COMMAND, [signal.SIGTERM]),
+        (RUN, [signal.SIGINT]),
+        (RUN, [signal.SIGTERM]),
+        (RUN, [signal.SIGINT, signal.SIGTERM]),  # the second one is obeyed sooner
+    ],
+)
+def test_signals_end_native_code_too(context: str, numbers: list[signal.Signals]) -> None:
+    program = PROGRAM.format(context=context)
+    command = [sys.executable, "-c", program, "--", *(str(int(number)) for number in numbers)]
     done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 128 + number
+    assert done.returncode in [128 + number for number in numbers]
     assert done.stderr == "midway: interrupted\n"

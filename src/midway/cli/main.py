@@ -5,7 +5,7 @@ import importlib.metadata
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -78,23 +78,24 @@ def train(
 
     declared = environments.entry(about.env(env))
     out = out or Path("runs") / run_name(declared.name, agent, seed)
-    run = api.train(
-        declared,
-        agent=agent,
-        preset=preset,
-        steps=steps,
-        seed=seed,
-        num_envs=num_envs,
-        out=out,
-        precision=precision,
-        on_env_error=on_env_error,
-        data=data,
-        changes=settings(set),
-        progress=True,
-        stop_at=stop_at,
-        callbacks=watching(wandb),
-        overwrite=overwrite,
-    )
+    with _ending_in_time(out):
+        run = api.train(
+            declared,
+            agent=agent,
+            preset=preset,
+            steps=steps,
+            seed=seed,
+            num_envs=num_envs,
+            out=out,
+            precision=precision,
+            on_env_error=on_env_error,
+            data=data,
+            changes=settings(set),
+            progress=True,
+            stop_at=stop_at,
+            callbacks=watching(wandb),
+            overwrite=overwrite,
+        )
     _say_where(run)
 
 
@@ -121,16 +122,17 @@ def resume(
     from midway import api
     from midway.runs.tracking import watching
 
-    continued = api.resume(
-        run,
-        steps=steps,
-        devices=devices,
-        progress=True,
-        from_step=from_,
-        stop_at=stop_at,
-        on_env_error=on_env_error,
-        callbacks=watching(wandb),
-    )
+    with _ending_in_time(run):
+        continued = api.resume(
+            run,
+            steps=steps,
+            devices=devices,
+            progress=True,
+            from_step=from_,
+            stop_at=stop_at,
+            on_env_error=on_env_error,
+            callbacks=watching(wandb),
+        )
     _say_where(continued)
 
 
@@ -324,7 +326,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
         use_compilation_cache()
         if list(arguments)[:1] and arguments[0] in KEEPING:
-            command()
+            with signals.ending_in_time():
+                command()
             return
         from midway.training.progress import showing_stages
 
@@ -358,6 +361,18 @@ def _fail(status: int, error: object) -> None:
     text = " ".join(str(error).split())
     print_line(f"midway: {text}")
     sys.exit(status)
+
+
+def _ending_in_time(path: Path) -> AbstractContextManager[None]:
+    """End a run by a signal even where native code keeps Python from it."""
+    from midway.runs import complete
+    from midway.runs.folder import RunFolder
+
+    folder = RunFolder(path)
+    return signals.ending_in_time(
+        lambda: f"interrupted in the middle of a step; {complete.left(folder)}",
+        lambda: complete.is_saving(folder),
+    )
 
 
 def _say_where(run: "Run") -> None:

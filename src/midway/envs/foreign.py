@@ -358,6 +358,7 @@ class ForeignVectorEnv(GoalVectorEnv):
             truncated = truncated | self._broken
             self._ended |= self._broken
             info |= {"broken": self._broken.copy(), "_broken": everyone.copy()}
+            self._fault.copies = np.flatnonzero(self._broken).tolist()
             self._fault.step = (observations, reward, terminated, truncated, info)
             raise self._fault
         return observations, reward, terminated, truncated, info
@@ -408,7 +409,9 @@ class ForeignVectorEnv(GoalVectorEnv):
                 shown, raised = ask(self._workers)
             except LostError as lost:
                 self._ended[:] = True
-                raise self._named(lost.copies[0], actions, str(lost)) from lost
+                error = self._named(lost.copies[0], actions, str(lost))
+                error.copies = range(self.num_envs) if actions is None else lost.copies
+                raise error from lost
         else:
             assert self._group is not None
             answer = (

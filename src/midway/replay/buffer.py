@@ -1,7 +1,7 @@
-"""Replay as pure functions: create, begin, add, sample.
+"""Replay as pure functions: create, begin, add, withdraw, sample.
 
-All run on the learner's device inside compiled steps. Donate the replay to a compiled ``begin`` or
-``add``, and the ring is written in place.
+All run on the learner's device inside compiled steps. Donate the replay to a compiled ``begin``,
+``add`` or ``withdraw``, and the ring is written in place.
 """
 
 import jax
@@ -64,11 +64,13 @@ def begin(replay: ReplayState, observation: Observation, mask: Bool[AnyArray, " 
     replay = write(replay, first, _goal_row(replay, observation), mask)
     replay = write(replay, first + 1, _state_row(replay, observation, jnp.zeros_like(mask)), mask)
     episode = insert(replay.episode, first, serial, mask)
+    num_rows = jnp.where(mask, first + 2, replay.num_rows)
     return replay._replace(
         episode=insert(episode, first + 1, serial, mask),
         first=insert(replay.first, serial, first, mask),
-        num_rows=jnp.where(mask, first + 2, replay.num_rows),
+        num_rows=num_rows,
         num_episodes=jnp.where(mask, serial + 1, replay.num_episodes),
+        written=jnp.maximum(replay.written, num_rows),
     )
 
 
@@ -92,6 +94,22 @@ def add(
     return replay._replace(
         episode=insert(replay.episode, position, replay.num_episodes - 1, mask),
         num_rows=position + mask,
+        written=jnp.maximum(replay.written, position + mask),
+    )
+
+
+def withdraw(replay: ReplayState, mask: Bool[AnyArray, " K"]) -> ReplayState:
+    """Take the newest episode of each masked lane out: nothing of it is drawn any more.
+
+    One that has lost its goal row is left alone: it is not drawn anyway.
+    """
+    newest = replay.num_episodes - 1
+    first = episode_first(replay, jnp.arange(newest.shape[0]), newest)
+    is_there = (first < replay.num_rows) & (first >= replay.written - replay.episode.shape[1])
+    mask = jnp.asarray(mask) & (newest >= 0) & is_there
+    return replay._replace(
+        num_rows=jnp.where(mask, first, replay.num_rows),
+        num_episodes=jnp.where(mask, newest, replay.num_episodes),
     )
 
 

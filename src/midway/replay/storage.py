@@ -2,8 +2,9 @@
 
 An episode is a contiguous block of rows in its lane: one goal row, then the rows of s_0 ... s_T.
 The row of s_t also holds the action taken in s_t, so the next observation is the next row and
-nothing is stored twice. Rows are named by their *position*, counted from the lane's first row ever
-written; the row at a position lies in slot ``position % L``, until position + L overwrites it.
+nothing is stored twice. Rows are named by their *position*, counted from the lane's first row; the
+row at a position lies in slot ``position % L``, until position + L overwrites it. An episode that
+is withdrawn gives its positions back, but not what its rows have overwritten.
 """
 
 from collections.abc import Mapping
@@ -25,8 +26,10 @@ class ReplayState(NamedTuple):
         episode: Serial number in its lane of the episode that a row belongs to.
         first: Position of the goal row of an episode, at its serial number modulo E. An episode
             ends where the next one begins, so no other bound is needed.
-        num_rows: Rows written in each lane since the start, fewer than 2**31.
-        num_episodes: Episodes begun in each lane since the start.
+        num_rows: Rows in each lane since the start without those withdrawn, fewer than 2**31.
+        num_episodes: Episodes begun in each lane since the start, without those withdrawn.
+        written: Positions of each lane that have been written: `num_rows`, or more after an
+            episode was withdrawn. Rows from ``written - L`` on are there.
     """
 
     rows: dict[str, Shaped[Array, "K L ..."]]
@@ -34,6 +37,7 @@ class ReplayState(NamedTuple):
     first: Int[Array, "K E"]
     num_rows: Int[Array, " K"]
     num_episodes: Int[Array, " K"]
+    written: Int[Array, " K"]
 
 
 class Live(NamedTuple):
@@ -74,6 +78,7 @@ def allocate(
         first=jnp.zeros((num_lanes, lane_rows // 3 + 1), jnp.int32),
         num_rows=jnp.zeros(num_lanes, jnp.int32),
         num_episodes=jnp.zeros(num_lanes, jnp.int32),
+        written=jnp.zeros(num_lanes, jnp.int32),
     )
 
 
@@ -120,7 +125,7 @@ def live(replay: ReplayState) -> Live:
     """
     num_lanes, lane_rows = replay.episode.shape
     lane = jnp.arange(num_lanes)
-    oldest = jnp.maximum(replay.num_rows - lane_rows, 0)
+    oldest = jnp.maximum(replay.written - lane_rows, 0)
     serial = replay.episode[lane, oldest % lane_rows]
     serial = jnp.where(episode_first(replay, lane, serial) == oldest, serial, serial + 1)
     start = episode_end(replay, lane, serial - 1)

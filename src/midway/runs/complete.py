@@ -1,6 +1,6 @@
 """Whether everything of a run's last step is there."""
 
-from midway import tables
+from midway import files, tables
 from midway.errors import ConfigurationError
 from midway.runs.folder import RunConfig, RunFolder, read_json
 from midway.training.arrays import checked_arrays
@@ -55,3 +55,16 @@ def had_checkpoint(folder: RunFolder, config: RunConfig) -> bool:
         return bool((tables.read(folder.metrics_file)["step"] > first).any())
     except (ConfigurationError, KeyError):
         return False
+
+
+def is_saving(folder: RunFolder) -> bool:
+    """Return whether a checkpoint is being written, or an old one removed."""
+    return any(folder.checkpoints.glob(f"*{files.UNFINISHED}"))
+
+
+def left(folder: RunFolder) -> str:
+    """Return what a run that was stopped can go on from."""
+    newest = max(steps_in(folder.checkpoints), default=None)
+    if newest is None:
+        return f"there is no checkpoint yet, to begin anew: midway resume {folder.path}"
+    return f"go on from the checkpoint of step {newest}: midway resume {folder.path}"

@@ -49,10 +49,10 @@ class RunSinks:
         self._logger.metrics(step, values)
         self._row = values
 
-    def evaluation(self, step: int, clock: loop.Clock, result: Evaluation) -> None:
-        """Write one row for an evaluated task and kind of action."""
-        self._logger.evaluation(step, clock, result)
-        self._results.append(result)
+    def evaluation(self, step: int, clock: loop.Clock, results: list[Evaluation]) -> None:
+        """Write a row for each evaluated task and kind of action: all of them, or none."""
+        self._logger.evaluation(step, clock, results)
+        self._results = results
 
     def watched(self, training: Training) -> bool:
         """Show what was written last to those who watch; note it where they end the run.

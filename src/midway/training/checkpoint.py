@@ -270,13 +270,10 @@ class Checkpoints:
             return {}
 
     def _stored(self, step: int, like: Stored) -> Stored:
-        """Return ``like`` without the counts that checkpoints of earlier versions do not have."""
-        there = self._metadata(step).get("collector", {})
-        parts = {name: part for name, part in like["collector"].items() if name in there}
-        if "counts" in parts:
-            counts = parts["counts"].items()
-            parts["counts"] = {n: count for n, count in counts if n in there["counts"]}
-        return {**like, "collector": parts}
+        """Return ``like`` without what checkpoints of earlier versions do not have."""
+        there = self._metadata(step)
+        parts = {name: _common(like[name], there.get(name, {})) for name in ("collector", "replay")}
+        return {**like, **parts}
 
 
 def steps_in(folder: Path) -> list[int]:
@@ -284,6 +281,15 @@ def steps_in(folder: Path) -> list[int]:
     if not folder.is_dir():
         return []
     return sorted(int(path.name) for path in folder.iterdir() if path.name.isdecimal())
+
+
+def _common(like: Stored, there: Stored) -> Stored:
+    """Return what is in both, from the first."""
+    return {
+        name: _common(part, there[name]) if isinstance(part, dict) else part
+        for name, part in like.items()
+        if name in there
+    }
 
 
 def _names(folder: Path) -> list[str]:

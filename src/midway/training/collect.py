@@ -64,6 +64,7 @@ class Collector:
             logged, by its name in ``metrics.csv``.
         restarts: Whether the run goes on where an environment breaks that can be made anew.
         moved: Whether the last step was taken; not if an environment raised in it.
+        stored: Whether it gave the replay anything; if not, the replay may be empty.
         fault: What was wrong with an environment in the last step, where the run cannot go on.
         in_a_row: Steps until now, one after the other, in which environments broke.
     """
@@ -76,6 +77,7 @@ class Collector:
     logged: dict[str, NumPyArray] = field(default_factory=dict)
     restarts: bool = False
     moved: bool = True
+    stored: bool = True
     fault: BrokenEnvironmentError | None = None
     in_a_row: int = 0
 
@@ -100,9 +102,9 @@ class Collector:
     def step(self, replay: ReplayState, choose: Actions) -> ReplayState:
         """Take one step in every environment; begin new episodes where one has ended.
 
-        The step of an environment that breaks, or whose simulation diverges, is not stored, and a
-        new episode begins there. Where the run must stop, that is noted as ``fault``; a step in
-        which an environment of others breaks is not taken then.
+        Where an environment breaks, or its simulation diverges, the step is not stored, the steps
+        of its episode before are withdrawn, and a new episode begins. Where the run must stop, that
+        is noted as ``fault``; a step in which an environment of others breaks is not taken then.
         """
         actions = choose(self.observation)
         self.moved, self.fault = True, None
@@ -112,6 +114,7 @@ class Collector:
         except BrokenEnvironmentError as error:
             if not self._goes_on(error) or error.step is None:
                 self.moved, self.begun = False, np.full(self.env.num_envs, self.fault is None)
+                replay = step.withdraw(replay, self._mask(error))
                 return self._begin(replay) if self.fault is None else replay
             taken = cast(Step, error.step)
         return self._store(replay, actions, taken)
@@ -128,6 +131,9 @@ class Collector:
             self.logged[column] += (info[name][sound].sum(), int(sound.sum()))
         failed = {"failed": info["failed"]} if "failed" in info else {}
         replay = step.add(replay, actions, self.observation | failed, sound)
+        self.stored = bool(sound.any())
+        if not sound.all():
+            replay = step.withdraw(replay, ~sound)
         ended = terminated | truncated
         if self.limit:
             ended = ended | (info["elapsed_steps"] >= self.limit)
@@ -160,6 +166,11 @@ class Collector:
             except BrokenEnvironmentError as error:
                 if not self._goes_on(error):
                     return replay
+                self.begun = self.begun | self._mask(error)
+
+    def _mask(self, error: BrokenEnvironmentError) -> NumPyArray:
+        """Return which environments an error is about."""
+        return np.isin(np.arange(self.env.num_envs), error.copies)
 
     def take_metrics(self) -> dict[str, float]:
         """Return means since the last call, NaN where there are none; then start anew."""

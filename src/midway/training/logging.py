@@ -1,7 +1,7 @@
 """The numbers of a run, into CSV files and TensorBoard."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from midway.tables import Appender
@@ -57,21 +57,33 @@ class Logger:
         self._metrics.write({"step": step, **dict.fromkeys(values, ""), **known})
         self._events.scalars(step, known)
 
-    def evaluation(self, step: int, clock: Mapping[str, int | float], result: Evaluation) -> None:
-        """Write one row for an evaluated task and kind of action."""
-        values = {
-            "success_rate": result.success_rate,
-            "final_distance": result.final_distance,
-            "episode_length": result.length,
-            **{f"final_distance_{name}": d for name, d in result.final_distances.items()},
-        }
-        row = {"task": result.task, "actions": result.actions, "episodes": len(result.episodes)}
-        row = {"step": step, **clock, **row, **values}
-        columns = dict.fromkeys([*EVALUATION_COLUMNS, *values])
-        self._evaluation.write({column: row[column] for column in columns})
-        prefix = f"eval/{result.task}/{result.actions}"
-        self._events.scalars(step, {f"{prefix}/{name}": value for name, value in values.items()})
+    def evaluation(
+        self, step: int, clock: Mapping[str, int | float], results: Sequence[Evaluation]
+    ) -> None:
+        """Write a row for each evaluated task and kind of action: all of them, or none."""
+        rows = [_row({"step": step, **clock}, result) for result in results]
+        self._evaluation.write_together(rows)
+        for result in results:
+            prefix = f"eval/{result.task}/{result.actions}"
+            values = _values(result).items()
+            self._events.scalars(step, {f"{prefix}/{name}": value for name, value in values})
 
     def close(self) -> None:
         """Put everything on disk."""
         self._events.close()
+
+
+def _values(result: Evaluation) -> dict[str, float]:
+    return {
+        "success_rate": result.success_rate,
+        "final_distance": result.final_distance,
+        "episode_length": result.length,
+        **{f"final_distance_{name}": d for name, d in result.final_distances.items()},
+    }
+
+
+def _row(when: Mapping[str, int | float], result: Evaluation) -> dict[str, object]:
+    values = _values(result)
+    what = {"task": result.task, "actions": result.actions, "episodes": len(result.episodes)}
+    row = {**when, **what, **values}
+    return {column: row[column] for column in dict.fromkeys([*EVALUATION_COLUMNS, *values])}

@@ -42,8 +42,8 @@ class Sinks(Protocol):
     def metrics(self, step: int, values: dict[str, int | float]) -> None:
         """Take one row of scalars."""
 
-    def evaluation(self, step: int, clock: Clock, result: Evaluation) -> None:
-        """Take one evaluation."""
+    def evaluation(self, step: int, clock: Clock, results: list[Evaluation]) -> None:
+        """Take the results of one evaluation, by task and kind of action."""
 
     def snapshot(self, training: Training) -> None:
         """Keep the weights of this step."""
@@ -77,7 +77,8 @@ def advance(training: Training) -> None:
     if not training.collector.moved:
         return
     steps, updates = training.counters.steps + train.num_envs, training.counters.updates
-    while train.updates_due(steps) - updates >= train.updates_per_call:
+    stored = training.collector.stored  # updates that are due after a step without wait for one
+    while stored and train.updates_due(steps) - updates >= train.updates_per_call:
         training.arrays, training.totals = training.program.train(
             training.arrays, training.totals, training.replay, key, updates
         )
@@ -303,7 +304,8 @@ def note_evaluation(
 ) -> dict[str, float]:
     """Evaluate, write a row for each task and kind of action, and return success by task.
 
-    The policy is kept before the rows are written: an evaluation whose rows are there is complete.
+    The policy is kept before the rows are written, all at once: an evaluation that has a row is
+    complete.
 
     Raises:
         Interrupted: The run shall end; nothing is written then.
@@ -313,8 +315,8 @@ def note_evaluation(
     results = list(evaluate(training, asked))
     for shown in results[:1]:
         _keep_the_best(training, sinks, shown, asked)
+    sinks.evaluation(counters.steps, _clock(counters), results)
     for result in results:
-        sinks.evaluation(counters.steps, _clock(counters), result)
         if result.actions == "mean":
             success[f"success/{result.task}"] = result.success_rate
     sinks.progress(counters.steps, success)

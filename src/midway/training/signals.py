@@ -1,24 +1,35 @@
 """Signals that ask a run for a checkpoint, or to end with one.
 
 Python runs their handlers between two of its own instructions: while a program is compiled, or one
-call of a simulator lasts, they wait.
+call of a simulator lasts, they wait. A thread of the command line does not.
 """
 
+import math
+import multiprocessing
 import os
+import select
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from types import FrameType
+from typing import NamedTuple
 
-from midway.training.terminal import print_line
+from midway.training.terminal import print_line, show_cursor
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGXCPU)
 """Signals that end a run with a checkpoint."""
 
 IMPATIENT = (signal.SIGINT, signal.SIGTERM)
 """Those of them that end it at once the second time; the system itself may repeat the others."""
+
+GRACE = 8.0
+"""Seconds for a run to obey a signal."""
+
+SECOND_GRACE = 1.0
+"""The same for a second one."""
 
 
 class Interrupted(Exception):  # noqa: N818 - nothing is wrong
@@ -91,8 +102,6 @@ class Ended(KeyboardInterrupt):
 def ending_soon(grace: float = 3.0) -> Iterator[None]:
     """End what keeps nothing by the first SIGINT or SIGTERM, within some seconds at most.
 
-    Python's handlers wait while native code runs; a thread that sees the signal does not.
-
     Args:
         grace: Seconds for Python's own handler; the process ends itself after them.
 
@@ -102,32 +111,98 @@ def ending_soon(grace: float = 3.0) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    reading, writing = os.pipe()
-    os.set_blocking(writing, False)
-    over = threading.Event()
-
-    def watch() -> None:
-        while number := os.read(reading, 1)[0]:
-            if number in IMPATIENT and not over.wait(grace):
-                print_line("midway: interrupted")
-                os._exit(128 + number)
-        os.close(reading)
-        os.close(writing)
 
     def end(number: int, frame: FrameType | None) -> None:
         raise Ended(number)
 
-    threading.Thread(target=watch, daemon=True).start()
     previous = {number: signal.signal(number, end) for number in IMPATIENT}
+    try:
+        with _watched(_Watch(IMPATIENT, grace, lambda: "interrupted", lambda: False)):
+            yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def ending_in_time(
+    last_line: Callable[[], str] = lambda: "interrupted", saving: Callable[[], bool] = lambda: False
+) -> AbstractContextManager[None]:
+    """End a run that does not obey a signal in time: after `GRACE`, or soon after a second one.
+
+    Files of a run are whole at any time: nothing is lost but the steps since its checkpoint.
+
+    Args:
+        last_line: What is said then.
+        saving: Whether a checkpoint is being written, which is waited for.
+    """
+    return _watched(_Watch(ENDING, GRACE, last_line, saving))
+
+
+class _Watch(NamedTuple):
+    """What a thread waits for that sees signals where native code keeps Python from them.
+
+    Attributes:
+        numbers: The signals.
+        grace: Seconds to obey one.
+        last_line: What is said where it was not obeyed.
+        saving: Whether more time is given.
+    """
+
+    numbers: tuple[int, ...]
+    grace: float
+    last_line: Callable[[], str]
+    saving: Callable[[], bool]
+
+    def wait(self, reading: int) -> None:
+        """Read the numbers of signals, until 0; leave where one was not obeyed."""
+        first, deadline, saving = 0, math.inf, self.saving
+        while True:
+            left = max(0.0, deadline - time.monotonic()) if first else None
+            if not select.select([reading], [], [], left)[0]:
+                if not saving():
+                    _leave(first, self.last_line)
+                    return
+                deadline = time.monotonic() + self.grace
+                continue
+            number = os.read(reading, 1)[0]
+            if number == 0:
+                return
+            if not first and number in self.numbers:
+                first, deadline = number, time.monotonic() + self.grace
+            elif first and number in IMPATIENT:
+                deadline, saving = min(deadline, time.monotonic() + SECOND_GRACE), lambda: False
+
+
+@contextmanager
+def _watched(watch: _Watch) -> Iterator[None]:
+    """Let a thread watch over what is done; outside of the main thread there are no signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    thread = threading.Thread(target=watch.wait, args=(reading,), daemon=True)
+    thread.start()
     descriptor = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     try:
         yield
     finally:
         signal.set_wakeup_fd(descriptor)
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-        over.set()
         os.write(writing, b"\0")
+        thread.join()
+        os.close(reading)
+        os.close(writing)
+
+
+def _leave(number: int, last_line: Callable[[], str]) -> None:
+    """End this process by a signal, and those that step environments."""
+    try:
+        print_line(f"midway: {last_line()}")
+        show_cursor()
+        for process in multiprocessing.active_children():
+            process.kill()
+    finally:
+        os._exit(128 + number)
 
 
 def _is_ignored(number: int) -> bool:

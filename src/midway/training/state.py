@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from midway.agent import AgentState, AnyAgent, Encoder, Memory
@@ -326,7 +327,10 @@ def load_state_dict(training: Training, state: Stored) -> None:
     training.arrays = with_named_arrays(training.arrays, state["agent"])
     training.memory = with_named_arrays(training.memory, state.get("memory", {}))
     training.totals = state["totals"]
-    replay = with_named_arrays(training.replay, state["replay"])
+    stored = state["replay"]
+    if "written" not in stored:  # in an earlier version, where nothing was withdrawn
+        stored = {**stored, "written": jnp.copy(stored["num_rows"])}
+    replay = with_named_arrays(training.replay, stored)
     training.collector, training.replay = Collector.restore(
         training.collector.env, replay, state["collector"]
     )
@@ -334,6 +338,6 @@ def load_state_dict(training: Training, state: Stored) -> None:
     training.collector.restarts = training.setup.train.on_env_error == RESTART
     fresh = training.begin_episodes(training.setup.train.num_envs)
     training.memory = acting.renew(training.memory, fresh, training.collector.begun)
-    stored = state["counters"]
-    fields = {name: type(old)(stored[name]) for name, old in Counters()._asdict().items()}
+    counters = state["counters"]
+    fields = {name: type(old)(counters[name]) for name, old in Counters()._asdict().items()}
     training.counters = Counters(**fields)

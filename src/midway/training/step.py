@@ -137,3 +137,6 @@ begin = compile_by_lane(buffer.begin)
 
 add = compile_by_lane(buffer.add)
 """Append steps in place (`midway.replay.buffer.add`)."""
+
+withdraw = compile_by_lane(buffer.withdraw)
+"""Take newest episodes out in place (`midway.replay.buffer.withdraw`)."""

@@ -12,6 +12,13 @@ def print_line(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
+def show_cursor() -> None:
+    """Show the cursor of a terminal, which a progress bar hides."""
+    if sys.stderr.isatty():
+        with heard():
+            print("\x1b[?25h", end="", file=sys.stderr, flush=True)
+
+
 @contextmanager
 def heard() -> Iterator[None]:
     """Say something on standard error; once nobody is there, all that follows is thrown away."""
