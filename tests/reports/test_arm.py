@@ -21,7 +21,7 @@ def stems(files):
 
 def test_the_report_of_states_draws_the_table(state_run, tmp_path):
     page, *figures = report([state_run], tmp_path)
-    names = {"learning-curves", "distances", "ris-table"}
+    names = {"learning-curves", "distances", "ris-table", "ris-failures"}
     assert stems(figures) == {f"push-state-{name}" for name in names}
     assert "no maze" not in page.read_text()
 
@@ -29,7 +29,7 @@ def test_the_report_of_states_draws_the_table(state_run, tmp_path):
 @needs_renderer
 def test_the_report_of_images_shows_what_is_imagined(image_run, tmp_path, quick_decoder):
     _, *figures = report([image_run], tmp_path)
-    names = {"learning-curves", "distances", "ris-table", "ris-images"}
+    names = {"learning-curves", "distances", "ris-table", "ris-failures", "ris-images"}
     assert stems(figures) == {f"push-{name}" for name in names}
     pixels = matplotlib.image.imread(tmp_path / "push-ris-images.png")
     assert pixels.shape[1] > 1_000
