@@ -27,6 +27,7 @@ def tune(
     pruner: Literal["median", "hyperband", "none"] = "median",
     space: Path | None = None,
     out: Path | None = None,
+    ray: str | None = None,
     set: tuple[str, ...] = (),
     about: AboutEnv = NOTHING,
 ) -> None:
@@ -42,6 +43,8 @@ def tune(
         pruner: What stops trials that are behind: median, hyperband or none.
         space: TOML file of what may be tried; default: learning rates and a few others.
         out: Folder of the study; default: runs/tune-ENV-AGENT.
+        ray: Address of a Ray cluster (auto: the one of this machine) whose machines share the
+            folder; default: this machine's cores, one trial on each.
         set: Settings that are the same in all trials, as NAME=VALUE.
         about: What midway must be told of an environment that is not its own.
     """
@@ -57,7 +60,7 @@ def tune(
     out = out or Path("runs") / run_name(f"tune-{env}", agent, seeds[0]).rpartition("-seed")[0]
     tuning.open_study(plan, out, pruner)
     with Live(console=Console(stderr=True), refresh_per_second=1) as live:
-        study = tuning.run(plan, trials, out, lambda s: live.update(tuning.table(s)), pruner)
+        study = tuning.run(plan, trials, out, lambda s: live.update(tuning.table(s)), pruner, ray)
     if sum(trial.state.is_finished() for trial in study.trials) < trials:
         print_line(f"stopped; type the same command again to go on: {out}")
         sys.exit(EXIT_INTERRUPTED)
