@@ -236,7 +236,9 @@ def test_from_the_command_line(
     out = tmp_path / "study"
     command = ["tune", "point-u", "--trials", "2", "--steps", "60", "--out", str(out)]
     main([*command, "--set", *TINY])
-    said = capsys.readouterr().out
+    said, told = capsys.readouterr()
+    assert "trial 0  complete  0.600\n" in told
+    assert told.count("trial 1  complete") == 1
     assert "quick itself: 0.6" in said
     assert str(out / "best.toml") in said
     found = presets.resolve("point-u", "ris", str(out / "best.toml"))

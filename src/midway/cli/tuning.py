@@ -12,6 +12,8 @@ from midway.errors import ConfigurationError
 from midway.training.terminal import print_line
 
 if TYPE_CHECKING:
+    from optuna import Study
+
     from midway.cluster.tune import Plan
 
 EXIT_INTERRUPTED = 130
@@ -59,8 +61,21 @@ def tune(
     plan = _plan(env, agent, preset, steps, seeds, space, settings(set), about)
     out = out or Path("runs") / run_name(f"tune-{env}", agent, seeds[0]).rpartition("-seed")[0]
     tuning.open_study(plan, out, pruner)
-    with Live(console=Console(stderr=True), refresh_per_second=1) as live:
-        study = tuning.run(plan, trials, out, lambda s: live.update(tuning.table(s)), pruner, ray)
+    if sys.stderr.isatty():
+        with Live(console=Console(stderr=True), refresh_per_second=1) as live:
+            study = tuning.run(
+                plan, trials, out, lambda s: live.update(tuning.table(s)), pruner, ray
+            )
+    else:
+        told: set[str] = set()
+
+        def tell(study: "Study") -> None:
+            for line in tuning.lines(study):
+                if line not in told:
+                    told.add(line)
+                    print_line(line)
+
+        study = tuning.run(plan, trials, out, tell, pruner, ray)
     if sum(trial.state.is_finished() for trial in study.trials) < trials:
         print_line(f"stopped; type the same command again to go on: {out}")
         sys.exit(EXIT_INTERRUPTED)

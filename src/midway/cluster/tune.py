@@ -316,13 +316,23 @@ def table(study: "optuna.Study") -> "Table":
     ended = sum(t.state.is_finished() for t in trials)
     view = Table("trial", "state", "score", "values", title=f"{ended} trials ended")
     for trial in (*running, *best):
-        score = trial.value
-        if score is None and (last := trial.last_step) is not None:
-            score = trial.intermediate_values[last]
         values = ", ".join(
             f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
             for name, value in trial.params.items()
         )
-        shown = "" if score is None else f"{score:.3f}"
-        view.add_row(str(trial.number), trial.state.name.lower(), shown, values)
+        view.add_row(str(trial.number), trial.state.name.lower(), _score(trial), values)
     return view
+
+
+def lines(study: "optuna.Study") -> list[str]:
+    """Return number, state and score of every trial, a line for each."""
+    trials = study.get_trials(deepcopy=False)
+    return [f"trial {t.number}  {t.state.name.lower()}  {_score(t)}".rstrip() for t in trials]
+
+
+def _score(trial: "optuna.trial.FrozenTrial") -> str:
+    """Return the score of a trial so far; nothing before its first evaluation."""
+    score, last = trial.value, trial.last_step
+    if score is None and last is not None:
+        score = trial.intermediate_values[last]
+    return "" if score is None else f"{score:.3f}"
