@@ -23,7 +23,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-TINY = ["hidden=(8,8)", "batch_size=8", "num_envs=4", "random_steps=40", "replay_capacity=2000"]
+TINY = ["hidden=(8,8)", "batch_size=8", "num_envs=4", "random_steps=40", "replay_capacity=10000"]
 TINY += ["evaluation_episodes=2", "log_every=20"]
 
 EXTRAS = ("plots", "video", "tune", "robotics")

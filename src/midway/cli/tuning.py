@@ -67,12 +67,12 @@ def tune(
                 plan, trials, out, lambda s: live.update(tuning.table(s)), pruner, ray
             )
     else:
-        told: set[str] = set()
+        told: dict[str, None] = {}
 
         def tell(study: "Study") -> None:
             for line in tuning.lines(study):
                 if line not in told:
-                    told.add(line)
+                    told[line] = None
                     print_line(line)
 
         study = tuning.run(plan, trials, out, tell, pruner, ray)

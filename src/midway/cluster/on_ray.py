@@ -44,7 +44,7 @@ def start(
     return [threading.Thread(target=collect, daemon=True)]
 
 
-def processors(address: str, ending: threading.Event) -> list[Execute]:
+def processors(address: str, ending: threading.Event) -> Sequence[Execute]:
     """Return what runs a job, once for each processor of the cluster.
 
     A job is told to stop by a file in its folder, which all machines see.

@@ -9,7 +9,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
@@ -105,7 +105,7 @@ def run(
             _try(study, trial, plan, folder, run_job)
 
     if ray_address is None:
-        cores = [_on_core(core, processes) for core in sorted(os.sched_getaffinity(0))]
+        cores: Sequence[Execute] = [_on_core(n, processes) for n in sorted(os.sched_getaffinity(0))]
     else:
         cores = on_ray.processors(ray_address, processes.ending)
     workers = [threading.Thread(target=work, args=(core,), daemon=True) for core in cores]

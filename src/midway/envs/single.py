@@ -114,7 +114,7 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
         picture = picture.repeat(times, axis=0).repeat(times, axis=1)
         if self._window is None:
             rate = int(self.metadata["render_fps"])
-            self._window = Window(*picture.shape[:2], rate, f"midway: {self.goal_spec.name}")
+            self._window = Window(picture.shape, rate, f"midway: {self.goal_spec.name}")
         self._window.show(picture)
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: object) -> ArrayLike:

@@ -22,13 +22,13 @@ class Window:
     """Shows pictures of one size, until it is closed or Esc pressed.
 
     Args:
-        height: Rows of a picture.
-        width: Columns of a picture.
+        shape: Shape of a picture: rows, columns, 3.
         rate: Pictures per second, at most.
         title: Its title.
     """
 
-    def __init__(self, height: int, width: int, rate: int, title: str) -> None:
+    def __init__(self, shape: tuple[int, ...], rate: int, title: str) -> None:
+        height, width, _ = shape
         command = [*VIEWER, str(width), str(height), str(rate), title]
         self._viewer = subprocess.Popen(command, stdin=PIPE, stderr=PIPE, env=_environment())
 

@@ -193,7 +193,7 @@ def play(frames: Iterator[Frame], rate: int, title: str) -> None:
         ConfigurationError: No window can be opened.
     """
     first = next(frames)
-    with closing(Window(*first.shape[:2], rate, title)) as window:
+    with closing(Window(first.shape, rate, title)) as window:
         for frame in chain([first], frames):
             if not window.show(frame):
                 return
