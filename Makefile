@@ -15,7 +15,7 @@ COVERAGE := --cov=midway
 
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 
-.PHONY: train check test test-all test-lowest tested site docs wheel release-check lint format clean
+.PHONY: train check test test-all test-lowest tested site docs links wheel release-check lint format clean
 
 # The tested set: newer releases of what midway needs come in through constraints.txt alone.
 $(VENV)/installed: pyproject.toml constraints.txt
@@ -55,6 +55,10 @@ site: $(VENV)/installed-extras
 docs: site
 	$(BIN)/pytest tests/test_docs.py
 
+# The pages' links to other sites. Needs a network, so CI has no part in it.
+links: $(VENV)/installed-extras
+	$(BIN)/sphinx-build --builder linkcheck --keep-going --quiet docs build/links
+
 # The quick tests with the oldest releases that pyproject.toml allows, in a venv of their own.
 test-lowest:
 	$(PYTHON) -m venv $(VENV)-lowest
@@ -68,8 +72,8 @@ test-lowest:
 wheel: $(VENV)/installed
 	$(BIN)/python -m build --outdir dist .
 
-# Builds both, and uses the wheel outside the checkout as a newcomer would.
-release-check: $(VENV)/installed
+# Builds both, types the README with the wheel outside the checkout, and resolves other Pythons.
+release-check: $(VENV)/installed-extras
 	$(BIN)/pytest tests/test_release.py
 
 # After `pip install --upgrade` and `make test-all`: what constraints.txt is to hold.

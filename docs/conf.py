@@ -25,6 +25,8 @@ autodoc_typehints = "description"
 autodoc_member_order = "bysource"
 napoleon_google_docstring = True
 exclude_patterns = ["_build"]
+linkcheck_timeout, linkcheck_retries = 20, 2
+linkcheck_report_timeouts_as_broken = True
 
 OUTSIDE = re.compile(r"\]\(((?:\.\./)+)benchmarks/README\.md")
 """Links of the pages to the results, which are a file of the repository and a page of the site."""

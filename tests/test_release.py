@@ -1,26 +1,43 @@
-"""What a newcomer does: install the wheel, and train on an environment of one's own.
+"""What a newcomer does: install the wheel, type the README, train on an environment of one's own.
 
-The wheel is built from the source distribution and installed into a fresh environment outside the
-checkout, which holds the libraries of the light core and none of an extra.
+The wheel is built from the source distribution and installed into fresh environments outside the
+checkout: one holds the libraries of the light core and none of an extra, the other those of the
+extras that the README names.
 """
 
 import os
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 import sysconfig
 import tarfile
 import tomllib
 import zipfile
+from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-TINY = ["hidden=(8,8)", "batch_size=8", "num_envs=4", "random_steps=40", "replay_capacity=2000"]
+TINY = ["hidden=(8,8)", "batch_size=8", "num_envs=4", "random_steps=40", "replay_capacity=10000"]
 TINY += ["evaluation_episodes=2", "log_every=20"]
+
+EXTRAS = ("plots", "video", "tune", "robotics")
+"""Extras of the README's commands."""
+
+SHORTER = {"--trials 20": "--trials 2", "--seeds 0 1 2": "--seeds 0"}
+"""What the README would train for longer than an hour, typed with fewer runs."""
+
+TRAINING = ("train", "sweep", "tune")
+
+OTHER_PYTHONS = ("3.12", "3.13", "3.14")
+
+WHEELS = ("plots", "video", "cluster", "tune", "data", "onnx")
+"""Extras that have wheels for them."""
 
 USE = """
 import numpy as np
@@ -58,13 +75,8 @@ def test_the_wheel_holds_the_package_and_nothing_else(built: Path) -> None:
 def test_from_the_wheel_to_a_policy_for_an_environment_of_ones_own(
     built: Path, tmp_path: Path
 ) -> None:
-    venv = tmp_path / "venv"
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(venv)], check=True)
+    venv = installed(built, tmp_path / "venv", requirements(()))
     python = venv / "bin" / "python"
-    (wheel,) = built.glob("*.whl")
-    pip = ("-m", "pip", "--python", str(python), "install", "--no-deps")
-    assert use(tmp_path, Path(sys.executable), *pip, str(wheel)).returncode == 0
-    link_core(Path(sysconfig.get_path("purelib", vars={"base": str(venv)})))
     page = (ROOT / "docs" / "your-own-task.md").read_text()
     found = re.search(r"```python boat\.py\n(.*?)```", page, re.DOTALL)
     assert found is not None
@@ -87,13 +99,76 @@ def test_from_the_wheel_to_a_policy_for_an_environment_of_ones_own(
     assert "pip install 'midway[plots]'" in drawn.stderr
 
 
-def link_core(site: Path) -> None:
-    """Link what midway without extras needs into an environment, as pip would install it."""
+@pytest.mark.extra
+@pytest.mark.timeout(5400)
+def test_the_readme_typed_line_by_line(built: Path, tmp_path: Path) -> None:
+    """Runs are as the README has them, with networks, budgets and studies that end soon."""
+    venv = installed(built, tmp_path / "venv", requirements(EXTRAS))
+    text = (ROOT / "README.md").read_text()
+    (commands,) = (block for block in blocks(text, "") if block.startswith("midway "))
+    (code,) = blocks(text, "python")
+    lines = [line.split("#")[0].strip() for line in commands.splitlines()]
+    lines = [part.strip() for line in lines for part in line.split("\N{MIDDLE DOT}")]
+    assert len(lines) > 15
+    for line in lines:
+        name, *words = shlex.split(shorter(line))
+        assert name == "midway"
+        typed = use(tmp_path, venv / "bin" / "midway", *words)
+        outside = "comes with a checkout" in typed.stderr and "zoo:" in line
+        assert typed.returncode == (2 if outside else 0), f"{line}: {typed.stderr}"
+    settings = ", ".join(f"'{name}': '{value}'" for name, value in (p.split("=") for p in TINY))
+    short = code.replace("steps=16_000", f"steps=200, changes={{{settings}}}")
+    assert short != code
+    used = use(tmp_path, venv / "bin" / "python", "-c", short)
+    assert used.returncode == 0, used.stderr
+
+
+@pytest.mark.parametrize("python", OTHER_PYTHONS)
+def test_other_pythons_have_wheels_of_the_tested_releases(python: str, tmp_path: Path) -> None:
+    """They resolve; nothing of them is run here."""
+    command = ["-m", "pip", "install", "--dry-run", "--ignore-installed", "--only-binary=:all:"]
+    command += ["--python-version", python, "--target", str(tmp_path / "nowhere")]
+    command += ["--constraint", str(ROOT / "constraints.txt"), *requirements(WHEELS)]
+    resolved = use(tmp_path, Path(sys.executable), *command)
+    assert resolved.returncode == 0, resolved.stderr
+    assert "Would install" in resolved.stdout
+    assert "jaxlib-" in resolved.stdout
+
+
+def blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+
+
+def shorter(line: str) -> str:
+    """Return a command of the README that ends soon."""
+    for long, short in SHORTER.items():
+        line = line.replace(long, short)
+    if line.split()[1] in TRAINING and "--help" not in line:
+        line += " --steps 200 --set " + " ".join(map(shlex.quote, TINY))
+    return line
+
+
+def requirements(extras: Sequence[str]) -> list[str]:
+    """Return what midway needs with some extras."""
+    of_extras = chain.from_iterable(PROJECT["optional-dependencies"][name] for name in extras)
+    own = [line for line in of_extras if not line.startswith("midway[")]
+    return [*PROJECT["dependencies"], *own]
+
+
+def installed(built: Path, venv: Path, wanted: Sequence[str]) -> Path:
+    """Return a fresh environment with the wheel and what it requires, as pip would install it."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(venv)], check=True)
+    (wheel,) = built.glob("*.whl")
+    python = str(venv / "bin" / "python")
+    pip = ("-m", "pip", "--python", python, "install", "--no-deps", str(wheel))
+    assert use(venv, Path(sys.executable), *pip).returncode == 0
+    site = Path(sysconfig.get_path("purelib", vars={"base": str(venv)}))
     closure = runpy.run_path(str(ROOT / ".ci" / "tested.py"))["closure"]
-    for distribution in closure(PROJECT["dependencies"]).values():
+    for distribution in closure(wanted).values():
         for top in {file.parts[0] for file in distribution.files or () if file.parts[0] != ".."}:
             if top != "__pycache__" and not (site / top).exists():
                 (site / top).symlink_to(distribution.locate_file(top))
+    return venv
 
 
 def use(folder: Path, program: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -1,8 +1,13 @@
-"""Tuning, with runs that are only written down."""
+"""Tuning, with runs that are only written down, and a cluster that is a few threads."""
 
 import os
+import sys
+import threading
+import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -10,7 +15,7 @@ from test_sweep import TINY
 
 from midway import presets, spaces
 from midway.cli.main import main
-from midway.cluster import jobs, tune
+from midway.cluster import jobs, on_ray, tune
 from midway.cluster.jobs import Job, Processes, State
 from midway.errors import ConfigurationError
 from midway.runs.folder import RunFolder
@@ -93,7 +98,7 @@ def test_a_study_goes_on_with_the_trial_that_was_interrupted(runs: Runs, tmp_pat
     distributions = {name: tune._distribution(choice) for name, choice in SPACE.items()}
     for _ in range(2):
         trial = first.ask(distributions)
-        tune._try(first, trial, PLAN, tmp_path, 0, Processes())
+        tune._try(first, trial, PLAN, tmp_path, tune._on_core(0, Processes()))
     assert [trial.state.name for trial in first.trials] == ["COMPLETE", "RUNNING"]
     runs.ends.clear()
     study = tune.run(PLAN, 3, tmp_path, unseen, "none")
@@ -103,6 +108,68 @@ def test_a_study_goes_on_with_the_trial_that_was_interrupted(runs: Runs, tmp_pat
     other = tune.Plan("point-u", "ris", "quick", 800, (0,), SPACE, PLAN.first)
     with pytest.raises(ConfigurationError, match="another steps"):
         tune.open_study(other, tmp_path)
+
+
+class Ray:
+    """In place of the package: each task is a thread."""
+
+    exceptions = SimpleNamespace(RayError=RuntimeError)
+
+    def __init__(self) -> None:
+        self.addresses: list[str] = []
+        self._threads = ThreadPoolExecutor()
+
+    def init(self, address: str, **options: object) -> None:
+        self.addresses.append(address)
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 2.0}
+
+    def remote(self, **options: object) -> Callable[..., object]:
+        return lambda function: SimpleNamespace(
+            remote=lambda *arguments: self._threads.submit(function, *arguments)
+        )
+
+    def wait(self, tasks: list[Future[bool]], timeout: float) -> tuple[object, object]:
+        return wait(tasks, timeout)
+
+    def get(self, task: Future[bool]) -> bool:
+        return task.result()
+
+
+@pytest.fixture
+def on_a_cluster(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> Ray:
+    ray = Ray()
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setattr(on_ray, "POLL_SECONDS", 0.01)
+
+    def execute(job: Job, folder: Path, stop: Callable[[], bool]) -> State:
+        return runs.execute(job, folder, 0, Processes(), lambda: time.sleep(0.05) or stop())
+
+    monkeypatch.setattr(on_ray, "execute", execute)
+    return ray
+
+
+def test_trials_on_a_cluster(on_a_cluster: Ray, runs: Runs, tmp_path: Path) -> None:
+    runs.ends = {"trial1": "failed"}
+    study = tune.run(PLAN, 3, tmp_path, unseen, "none", "here:auto")
+    assert on_a_cluster.addresses == ["here:auto"]
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE", "FAIL", "COMPLETE"]
+    assert tune.run(PLAN, 3, tmp_path, unseen, "none", "auto").trials == study.trials
+
+
+def test_a_trial_on_a_cluster_is_told_to_stop_by_a_file(
+    on_a_cluster: Ray, runs: Runs, tmp_path: Path
+) -> None:
+    """By the study, or because the command ends."""
+    job, ending = PLAN.job(0, 0, PLAN.first), threading.Event()
+    (run, _) = on_ray.processors("auto", ending)
+    assert run(job, tmp_path, lambda: True) == "failed"
+    ending.set()
+    assert run(job, tmp_path, lambda: False) == "stopped"
+    rows = RunFolder(tmp_path / job.name).evaluation_file.read_text()
+    assert "400,hard" not in rows
+    assert not list(tmp_path.glob("*.stop"))
 
 
 def test_failed_runs_are_no_trials_to_choose_from(runs: Runs, tmp_path: Path) -> None:
@@ -169,7 +236,9 @@ def test_from_the_command_line(
     out = tmp_path / "study"
     command = ["tune", "point-u", "--trials", "2", "--steps", "60", "--out", str(out)]
     main([*command, "--set", *TINY])
-    said = capsys.readouterr().out
+    said, told = capsys.readouterr()
+    assert "trial 0  complete  0.600\n" in told
+    assert told.count("trial 1  complete") == 1
     assert "quick itself: 0.6" in said
     assert str(out / "best.toml") in said
     found = presets.resolve("point-u", "ris", str(out / "best.toml"))

@@ -279,6 +279,10 @@ def test_registered_environments_draw_themselves(name):
     assert gymnasium.make(f"midway/{name}-v0").unwrapped.render() is None
 
 
-def test_other_ways_to_draw_are_refused():
-    with pytest.raises(ConfigurationError, match="render_mode 'ansi'"):
+def test_other_ways_to_draw_are_refused(monkeypatch):
+    with pytest.raises(ConfigurationError, match="render_mode 'ansi': must be human, rgb_array"):
         SingleGoalEnv("point-u", render_mode="ansi")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ConfigurationError, match="needs a display, and there is none here"):
+        SingleGoalEnv("point-u", render_mode="human")

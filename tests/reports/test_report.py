@@ -22,6 +22,7 @@ from midway.reports.imagined import density, halvings
 from midway.reports.recordings import Recording
 from midway.reports.runs import groups
 from midway.runs.folder import write_json
+from midway.types import DistanceTask
 
 FIGURES = {"learning-curves", "ris-map", "difficulty", "ris-subgoals", "ris-values", "health"}
 FIGURES |= {"ris-failures"}
@@ -85,6 +86,28 @@ def test_failures_are_shown_and_told_apart():
     assert said.startswith("Of 3 failures, 1 lay on their backs; 1 ended less than 1 m before")
     assert [episode.task for episode in failures.chosen(episodes)] == ["hard", "uniform", "hard"]
     assert len(failures.draw(maze, episodes).axes) == 3
+
+
+def test_failures_elsewhere_than_in_mazes_are_told_apart_by_their_distances():
+    task = DistanceTask(((0,), (1,)), 0.1, ("hand", "puck"))
+    goal, still = np.zeros(2, np.float32), np.ones((11, 2), np.float32)
+    whole = np.linspace(1, 0, 11, dtype=np.float32)[:, None] * still
+    ways = {
+        "were ended by the environment": whole[:5],
+        "ended with less than 25": 0.15 + 0.85 * whole,
+        "ended no nearer": 1 + still - whole,
+        "stood still": np.concatenate([still[:1], 0.5 * still[1:]]),
+        "were still on their way": 0.5 + 0.5 * whole,
+    }
+    episodes = [Recording("hard", way, goal, way, goal, False, 1.0) for way in ways.values()]
+    said = failures.conclusion_of_distances(task, episodes, limit=10)
+    for words in ways:
+        assert f"1 {words}" in said
+    episodes.append(Recording("hard", whole, goal, whole, goal, True, 0.0))
+    figure = failures.draw_distances(task, episodes, " (m)")
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["hand", "puck"]
+    for axes in figure.axes:
+        assert sum(line.get_marker() == "X" for line in axes.lines) == 5
 
 
 def test_the_page_stands_alone(single):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import midway
-from midway import api
+from midway import api, tables
 from midway.cli.main import main
 from midway.errors import ConfigurationError
 from midway.reports import curves
@@ -173,13 +173,28 @@ def test_what_a_killed_process_kept_later_does_not_change_the_best(
     assert (run / "policies" / "best.safetensors").read_bytes() == before
 
 
-def test_a_run_that_reached_nothing_has_no_best_policy(whole: Path, tmp_path: Path) -> None:
+def test_a_run_that_reached_nothing_has_no_best_policy(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = shutil.copytree(whole, tmp_path / "run")
     (run / "policies" / "best.safetensors").write_bytes(b"damaged")
     assert kept.best(RunFolder(run)) is None
     with pytest.raises(ConfigurationError, match="cannot be read"):
         midway.load(run, "best")
     (run / "policies" / "best.safetensors").unlink()
-    with pytest.raises(ConfigurationError, match="no best policy"):
+    with pytest.raises(ConfigurationError, match="no best policy: no evaluation that reached"):
         midway.load(run, "best")
     assert midway.load(run).step == 120
+    table = tables.read(run / "evaluation.csv")
+    tables.write(run / "evaluation.csv", {**table, "success_rate": 0 * table["success_rate"]})
+    for command in ("evaluate", "report", "watch"):
+        with pytest.raises(SystemExit) as stop:
+            main([command, str(run), "--policy", "best"])
+        assert stop.value.code == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert "none of its 7 evaluations of hard has reached a goal" in said
+        assert "--policy last" in said
+    (run / "evaluation.csv").unlink()
+    with pytest.raises(ConfigurationError, match="no evaluation yet"):
+        midway.load(run, "best")

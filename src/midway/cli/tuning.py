@@ -12,6 +12,8 @@ from midway.errors import ConfigurationError
 from midway.training.terminal import print_line
 
 if TYPE_CHECKING:
+    from optuna import Study
+
     from midway.cluster.tune import Plan
 
 EXIT_INTERRUPTED = 130
@@ -27,6 +29,7 @@ def tune(
     pruner: Literal["median", "hyperband", "none"] = "median",
     space: Path | None = None,
     out: Path | None = None,
+    ray: str | None = None,
     set: tuple[str, ...] = (),
     about: AboutEnv = NOTHING,
 ) -> None:
@@ -42,6 +45,8 @@ def tune(
         pruner: What stops trials that are behind: median, hyperband or none.
         space: TOML file of what may be tried; default: learning rates and a few others.
         out: Folder of the study; default: runs/tune-ENV-AGENT.
+        ray: Address of a Ray cluster (auto: the one of this machine) whose machines share the
+            folder; default: this machine's cores, one trial on each.
         set: Settings that are the same in all trials, as NAME=VALUE.
         about: What midway must be told of an environment that is not its own.
     """
@@ -56,8 +61,21 @@ def tune(
     plan = _plan(env, agent, preset, steps, seeds, space, settings(set), about)
     out = out or Path("runs") / run_name(f"tune-{env}", agent, seeds[0]).rpartition("-seed")[0]
     tuning.open_study(plan, out, pruner)
-    with Live(console=Console(stderr=True), refresh_per_second=1) as live:
-        study = tuning.run(plan, trials, out, lambda s: live.update(tuning.table(s)), pruner)
+    if sys.stderr.isatty():
+        with Live(console=Console(stderr=True), refresh_per_second=1) as live:
+            study = tuning.run(
+                plan, trials, out, lambda s: live.update(tuning.table(s)), pruner, ray
+            )
+    else:
+        told: dict[str, None] = {}
+
+        def tell(study: "Study") -> None:
+            for line in tuning.lines(study):
+                if line not in told:
+                    told[line] = None
+                    print_line(line)
+
+        study = tuning.run(plan, trials, out, tell, pruner, ray)
     if sum(trial.state.is_finished() for trial in study.trials) < trials:
         print_line(f"stopped; type the same command again to go on: {out}")
         sys.exit(EXIT_INTERRUPTED)

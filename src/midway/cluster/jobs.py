@@ -64,6 +64,10 @@ class Job:
         return int(given[-1]) if given else None
 
 
+Execute: TypeAlias = Callable[[Job, Path, Callable[[], bool]], State]
+"""Runs a job of a folder to its end, or until it is told to stop; returns how it ended."""
+
+
 class Processes:
     """The processes of the runs that are going on, which can be ended together."""
 

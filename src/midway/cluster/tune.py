@@ -1,4 +1,4 @@
-"""Tuning: trials of settings by Optuna, each of them runs on a core of this machine.
+"""Tuning: trials of settings by Optuna, each on a core of this machine or of a Ray cluster.
 
 The study is a SQLite file in its folder; typed again, it goes on, and runs that were interrupted
 are resumed. The first trial is the preset itself, so that every study says what tuning was worth.
@@ -9,7 +9,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from midway import tables
-from midway.cluster.jobs import POLL_SECONDS, Job, Processes, execute
+from midway.cluster import on_ray
+from midway.cluster.jobs import POLL_SECONDS, Execute, Job, Processes, execute
 from midway.cluster.sweep import ending
 from midway.errors import ConfigurationError, needing
 from midway.runs.folder import RunFolder
@@ -75,25 +76,38 @@ def run(
     folder: Path,
     show: Callable[["optuna.Study"], None],
     pruner: Pruner = "median",
+    ray_address: str | None = None,
 ) -> "optuna.Study":
     """Run trials until the study has so many, one on each core, and return it.
 
+    Args:
+        plan: What is tuned.
+        trials: Trials of the study in all.
+        folder: Its folder; on a cluster, one that all machines share.
+        show: Is told about the study every second.
+        pruner: What stops trials early.
+        ray_address: As of a sweep.
+
     Raises:
-        ConfigurationError: Optuna is missing, or the folder cannot be used or holds another study.
+        ConfigurationError: Optuna is missing, the folder cannot be used or holds another study, or
+            Ray is missing or not reached.
     """
     study = open_study(plan, folder, pruner)
     processes, turn = Processes(), threading.Lock()
     left = _interrupted(study)
 
-    def work(core: int) -> None:
+    def work(run_job: Execute) -> None:
         while not processes.ending.is_set():
             with turn:
                 trial = left.pop() if left else _next(study, plan, trials)
             if trial is None:
                 return
-            _try(study, trial, plan, folder, core, processes)
+            _try(study, trial, plan, folder, run_job)
 
-    cores = sorted(os.sched_getaffinity(0))
+    if ray_address is None:
+        cores: Sequence[Execute] = [_on_core(n, processes) for n in sorted(os.sched_getaffinity(0))]
+    else:
+        cores = on_ray.processors(ray_address, processes.ending)
     workers = [threading.Thread(target=work, args=(core,), daemon=True) for core in cores]
     with ending(processes):
         for worker in workers:
@@ -103,6 +117,11 @@ def run(
             time.sleep(POLL_SECONDS)
     show(study)
     return study
+
+
+def _on_core(core: int, processes: Processes) -> Execute:
+    """Return what runs a job on a core of this machine."""
+    return lambda job, folder, stop: execute(job, folder, core, processes, stop)
 
 
 def open_study(plan: Plan, folder: Path, pruner: Pruner = "median") -> "optuna.Study":
@@ -185,8 +204,7 @@ def _try(
     trial: "optuna.Trial",
     plan: Plan,
     folder: Path,
-    core: int,
-    processes: Processes,
+    run_job: Execute,
 ) -> None:
     """Run a trial, one seed after the other, and tell the study what came of it."""
     import optuna
@@ -205,7 +223,7 @@ def _try(
 
     for seed in plan.seeds:
         job = plan.job(trial.number, seed, trial.params)
-        state = execute(job, folder, core, processes, stop)
+        state = run_job(job, folder, stop)
         if pruned.is_set():
             study.tell(trial, state=optuna.trial.TrialState.PRUNED)
             return
@@ -298,13 +316,23 @@ def table(study: "optuna.Study") -> "Table":
     ended = sum(t.state.is_finished() for t in trials)
     view = Table("trial", "state", "score", "values", title=f"{ended} trials ended")
     for trial in (*running, *best):
-        score = trial.value
-        if score is None and (last := trial.last_step) is not None:
-            score = trial.intermediate_values[last]
         values = ", ".join(
             f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
             for name, value in trial.params.items()
         )
-        shown = "" if score is None else f"{score:.3f}"
-        view.add_row(str(trial.number), trial.state.name.lower(), shown, values)
+        view.add_row(str(trial.number), trial.state.name.lower(), _score(trial), values)
     return view
+
+
+def lines(study: "optuna.Study") -> list[str]:
+    """Return number, state and score of every trial, a line for each."""
+    trials = study.get_trials(deepcopy=False)
+    return [f"trial {t.number}  {t.state.name.lower()}  {_score(t)}".rstrip() for t in trials]
+
+
+def _score(trial: "optuna.trial.FrozenTrial") -> str:
+    """Return the score of a trial so far; nothing before its first evaluation."""
+    score, last = trial.value, trial.last_step
+    if score is None and last is not None:
+        score = trial.intermediate_values[last]
+    return "" if score is None else f"{score:.3f}"

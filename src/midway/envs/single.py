@@ -7,11 +7,15 @@ import numpy as np
 
 from midway.envs.registry import make_vec
 from midway.envs.vector import Array
+from midway.envs.window import Window, check_display
 from midway.errors import ConfigurationError
 from midway.types import ArrayLike, Info, Observations, Options
 
 Scalars: TypeAlias = dict[str, float | int]
 """Info of one environment."""
+
+SMALLEST_WINDOW = 480
+"""Pixels that the longer side of a picture is enlarged to in a window, in whole multiples."""
 
 
 class SingleGoalEnv(gymnasium.Env[Observations, Array]):
@@ -22,18 +26,23 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
     Args:
         name: A name of the registry, such as ``point-u``.
         task: A task of the environment.
-        render_mode: ``rgb_array``, or None for no pictures; ``midway watch --live`` has a window.
+        render_mode: ``rgb_array``; ``human``, a window that ``reset`` and ``step`` draw in, until
+            it is closed; or None for no pictures.
 
     Raises:
-        ConfigurationError: An unknown name, task or render mode.
+        ConfigurationError: An unknown name, task or render mode, or no display for a window.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(self, name: str, task: str = "uniform", render_mode: str | None = None) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ConfigurationError(f"render_mode {render_mode!r}: must be rgb_array or None")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            modes = ", ".join(self.metadata["render_modes"])
+            raise ConfigurationError(f"render_mode {render_mode!r}: must be {modes} or None")
+        if render_mode == "human":
+            check_display()
         self.render_mode = render_mode
+        self._window: Window | None = None
         self.vector = make_vec(name, num_envs=1, task=task, num_threads=1)
         self.goal_spec = self.vector.goal_spec
         self.observation_space: gymnasium.Space[Any] = self.vector.single_observation_space
@@ -51,6 +60,8 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
         # One generator serves both, so that what Gymnasium sees of it is true.
         self.vector.generators[0] = self.np_random
         observations, info = self.vector.reset(options=options)
+        if self.render_mode == "human":
+            self.render()
         return _first(observations), _first_info(info)
 
     def step(self, action: Array) -> tuple[Observations, float, bool, bool, Scalars]:
@@ -66,6 +77,8 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
         observations, reward, terminated, truncated, info = self.vector.step(
             np.asarray(action)[None]
         )
+        if self.render_mode == "human":
+            self.render()
         return (
             _first(observations),
             float(reward[0]),
@@ -75,13 +88,34 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
         )
 
     def render(self) -> Array | None:  # type: ignore[override]
-        """Return a picture ``(rows, columns, 3)`` uint8; None without a render mode.
+        """Return a picture ``(rows, columns, 3)`` uint8; None without ``rgb_array``.
 
         Raises:
             ConfigurationError: Nothing here can draw.
         """
         pictures = self.vector.render() if self.render_mode else None
-        return np.asarray(pictures[0]) if pictures else None
+        if not pictures:
+            return None
+        if self.render_mode == "rgb_array":
+            return np.asarray(pictures[0])
+        self._show(np.asarray(pictures[0]))
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one, and the simulation."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+        self.vector.close()
+
+    def _show(self, picture: Array) -> None:
+        """Show a picture in the window, which the first one opens; once closed, it stays so."""
+        times = max(1, round(SMALLEST_WINDOW / max(picture.shape[:2])))
+        picture = picture.repeat(times, axis=0).repeat(times, axis=1)
+        if self._window is None:
+            rate = int(self.metadata["render_fps"])
+            self._window = Window(picture.shape, rate, f"midway: {self.goal_spec.name}")
+        self._window.show(picture)
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: object) -> ArrayLike:
         """Return the reward of goals ``(goal_dim,)`` or ``(n, goal_dim)``; info is not used.

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from midway import tables
 from midway.envs.geodesic import geodesic_distance
 from midway.envs.mazes import ROBOT_RADIUS, Maze
-from midway.envs.views import MazeView, TableView
-from midway.errors import ConfigurationError
+from midway.envs.views import MazeView
+from midway.errors import BrokenEnvironmentError, ConfigurationError
 from midway.networks.decoder import ImageDecoder
 from midway.reports import decoder, recordings
 from midway.reports.recordings import Recording, record
@@ -41,8 +41,8 @@ SNAPSHOTS = 4
 SPACING = 0.25
 """Distance between points of the value map (m)."""
 
-ON_TABLE = {"hard": 3, "uniform": 3}
-"""Episodes of each task at the table."""
+ON_TABLE, ELSEWHERE = {"hard": 3, "uniform": 3}, {"uniform": 12}
+"""Episodes of each task at the table, and in environments without a view."""
 
 
 @dataclass(frozen=True)
@@ -124,9 +124,10 @@ class Study:
 
     @cached_property
     def recordings(self) -> list[Recording]:
-        """Whole episodes of the deterministic policy: many in a maze, a few at a table."""
-        counts = self._counts() if isinstance(self.view, MazeView) else ON_TABLE
-        return record(self.policy, counts, SEED)
+        """Whole episodes of the deterministic policy: many in a maze, a few elsewhere."""
+        if isinstance(self.view, MazeView):
+            return record(self.policy, self._counts(), SEED)
+        return record(self.policy, ELSEWHERE if self.view is None else ON_TABLE, SEED)
 
     @cached_property
     def decoder(self) -> ImageDecoder | None:
@@ -143,7 +144,7 @@ class Study:
         """
         if isinstance(self.view, MazeView):
             self.episodes()
-        elif isinstance(self.view, TableView):
+        else:
             assert self.recordings
 
     def episodes(self) -> list[Episode]:
@@ -322,7 +323,7 @@ class Cache:
         study = Study(run, self._folder)
         try:
             study.prepare()
-        except ConfigurationError as error:
+        except (ConfigurationError, BrokenEnvironmentError) as error:
             self.note(f"{name}: the policy cannot be used: {error}")
             return None
         return study

@@ -63,13 +63,15 @@ def report(
         The files that were written: the page, then the figures.
 
     Raises:
-        ConfigurationError: A path is no run folder, or ``out`` cannot be written.
+        ConfigurationError: A path is no run folder, no run has kept the policy, or ``out`` cannot
+            be written.
     """
     paths = [Path(run) for run in ([runs] if isinstance(runs, str | Path) else runs)]
     if not paths:
         raise ConfigurationError("no run folder given")
     folders = {path.resolve(): path for path in paths}
     found = [read(path, policy) for path in folders.values()]
+    _check_kept(found)
     alone = len(found) == 1
     place = found[0].folder.figures if alone else paths[0].resolve().parent / "report"
     place = place if out is None else Path(out)
@@ -78,6 +80,18 @@ def report(
         return _write(found, place)
     except OSError as error:
         raise ConfigurationError(f"cannot write the report to {place}: {error.strerror}") from error
+
+
+def _check_kept(found: Sequence[RunData]) -> None:
+    """Refuse a policy that no run has kept; where one has, the page says which have not."""
+    errors = []
+    for run in found:
+        try:
+            assert run.weights
+        except ConfigurationError as error:
+            errors.append(error)
+    if len(errors) == len(found):
+        raise errors[0]
 
 
 def pictures(runs: Runs, cache: Cache) -> Iterator[Picture]:
@@ -129,4 +143,4 @@ def _unfinished(runs: Runs) -> Iterator[str]:
             if not run.evaluation:
                 yield f"{where}: no evaluation yet"
     if runs.view is None:
-        yield f"{runs.env} has no view, so nothing is drawn of the policies themselves"
+        yield f"{runs.env} has no view, so of the policies themselves failures alone are drawn"

@@ -1,10 +1,8 @@
 """Videos of a policy with the subgoals that it imagines on its way, as files or in a window."""
 
-import os
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from itertools import chain
 from pathlib import Path
 from subprocess import PIPE
@@ -12,6 +10,7 @@ from subprocess import PIPE
 import numpy as np
 from PIL import Image
 
+from midway.envs.window import Window, check_display
 from midway.errors import ConfigurationError, needing
 from midway.reports import scenes
 from midway.reports.recordings import Recording, record
@@ -31,12 +30,6 @@ HOLD = 0.8
 """How long the end of an episode stays (s)."""
 
 GIF_COLOURS = 64
-
-# Without -P the modules beside the program would hide those of Python's library.
-VIEWER = (sys.executable, "-P", str(Path(__file__).with_name("viewer.py")))
-
-RENDERING = ("PYOPENGL_PLATFORM", "MUJOCO_GL")
-"""Variables that this process may have set to draw without a display."""
 
 
 def watch(
@@ -188,17 +181,6 @@ def _frames(scene: Scene, recording: Recording, stride: int, rate: int) -> Itera
         yield last
 
 
-def check_display() -> None:
-    """Try the display.
-
-    Raises:
-        ConfigurationError: There is none; the text is one line that says why.
-    """
-    tried = subprocess.run(VIEWER, capture_output=True, env=_environment())
-    if tried.returncode != 0:
-        raise _no_display(tried.stderr)
-
-
 def play(frames: Iterator[Frame], rate: int, title: str) -> None:
     """Show frames until the last one, or until the window is closed or Esc pressed.
 
@@ -211,23 +193,7 @@ def play(frames: Iterator[Frame], rate: int, title: str) -> None:
         ConfigurationError: No window can be opened.
     """
     first = next(frames)
-    height, width = first.shape[:2]
-    command = [*VIEWER, str(width), str(height), str(rate), title]
-    with subprocess.Popen(command, stdin=PIPE, stderr=PIPE, env=_environment()) as viewer:
-        assert viewer.stdin is not None
-        with suppress(BrokenPipeError):  # the window was closed
-            for frame in chain([first], frames):
-                viewer.stdin.write(frame.tobytes())
-        _, words = viewer.communicate()
-    if viewer.returncode != 0:
-        raise _no_display(words)
-
-
-def _environment() -> dict[str, str]:
-    return {name: value for name, value in os.environ.items() if name not in RENDERING}
-
-
-def _no_display(words: bytes) -> ConfigurationError:
-    """Return the error with the last line that the viewer said."""
-    lines = words.decode(errors="replace").strip().splitlines() or ["it cannot be opened"]
-    return ConfigurationError(f"--live needs a display, and there is none here: {lines[-1]}")
+    with closing(Window(first.shape, rate, title)) as window:
+        for frame in chain([first], frames):
+            if not window.show(frame):
+                return

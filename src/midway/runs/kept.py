@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+from midway import tables
 from midway.errors import ConfigurationError
 from midway.runs.folder import RunFolder
 from midway.statistics import Estimate, of_policy
@@ -52,8 +53,8 @@ def weights_of(folder: RunFolder, which: Which = "last") -> Path:
         if folder.best_weights.exists():
             return folder.best_weights
         raise ConfigurationError(
-            f"run folder {folder.path}: no best policy: no evaluation has reached a goal yet, or "
-            "an earlier version trained it"
+            f"run folder {folder.path}: no best policy: {_why_no_best(folder)}: take the last one "
+            "(--policy last)"
         )
     kept = {**snapshots(folder), **{step: file for file, step in _named(folder)}}
     if which not in kept:
@@ -62,6 +63,19 @@ def weights_of(folder: RunFolder, which: Which = "last") -> Path:
             f"run folder {folder.path}: no policy of step {which} was kept: there are {there}"
         )
     return kept[which]
+
+
+def _why_no_best(folder: RunFolder) -> str:
+    """Return why a run has no best policy, by its evaluations of the task that chooses it."""
+    try:
+        table = tables.read(folder.evaluation_file)
+        task = "hard" if (table["task"] == "hard").any() else "uniform"
+        rates = table["success_rate"][(table["task"] == task) & (table["actions"] == "mean")]
+    except (ConfigurationError, KeyError):
+        return "no evaluation yet"
+    if rates.any():
+        return "no evaluation that reached goals was confirmed, or an earlier version trained it"
+    return f"none of its {len(rates)} evaluations of {task} has reached a goal"
 
 
 def _named(folder: RunFolder) -> Iterator[tuple[Path, int]]:
