@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from midway import tables
-from midway.envs.geodesic import geodesic_distance
-from midway.envs.mazes import ROBOT_RADIUS, Maze
+from midway.envs.geodesic import OBSERVED, geodesic_distance
+from midway.envs.mazes import Maze
 from midway.envs.views import MazeView, TableView
 from midway.errors import ConfigurationError
 from midway.networks.decoder import ImageDecoder
@@ -25,7 +25,7 @@ from midway.tables import Table
 SEED = 20_210_718
 """Seed of starts and goals in figures: the same for every run, and met in no training."""
 
-VERSION = 3
+VERSION = 4
 """Counted up when the same policy would give other tables."""
 
 STEPS = 30_000
@@ -69,8 +69,8 @@ class Episode:
 class Study:
     """The saved policy of one run: what it does and what it imagines.
 
-    Tables are files, which a second report reads instead; their names hold a digest of the weights,
-    so another policy has other files.
+    Tables are files, which a second report reads instead; their names hold a digest of the weights
+    and of the settings of acting, so another policy has other files.
 
     Args:
         run: A run with a saved policy.
@@ -100,8 +100,9 @@ class Study:
 
     @property
     def where(self) -> str:
-        """The run's seed and the step of its policy, for captions."""
-        return f"seed {self.run.config.seed}, step {self.run.policy_step:,}"
+        """The run's seed, the step of its policy and changed settings, for captions."""
+        changes = "".join(f", {name} {value}" for name, value in self.run.changes.items())
+        return f"seed {self.run.config.seed}, step {self.run.policy_step:,}{changes}"
 
     @cached_property
     def policy(self) -> Policy:
@@ -110,7 +111,7 @@ class Study:
         Raises:
             ConfigurationError: It is damaged or foreign.
         """
-        return policies.load(self.run.folder, self.run.weights)
+        return self._loaded(self.run.weights)
 
     @property
     def maze(self) -> Maze:
@@ -211,7 +212,10 @@ class Study:
     def _policy_of(self, weights: Path) -> Policy:
         if weights == self.run.weights:
             return self.policy
-        return policies.load(self.run.folder, weights)
+        return self._loaded(weights)
+
+    def _loaded(self, weights: Path) -> Policy:
+        return policies.load(self.run.folder, weights).using(self.run.changes)
 
     def _snapshots(self) -> dict[int, Path]:
         """Return weights by step: some of the past, and the newest."""
@@ -246,7 +250,7 @@ class Study:
 
     def _table(self, name: str, compute: Callable[[], Table], *weights: Path) -> Table:
         """Return a table from its file, or compute it and write the file."""
-        digest = hashlib.sha256(f"{VERSION} {SEED} {self.maze}".encode())
+        digest = hashlib.sha256(f"{VERSION} {SEED} {self.maze} {self.run.acting}".encode())
         for file in (self.run.weights, *weights):
             digest.update(file.read_bytes())
         path = self._folder / f"{self.run.name}-{digest.hexdigest()[:10]}-{name}.csv"
@@ -258,8 +262,6 @@ class Study:
         position, episodes = self._maze_view.position, self.recordings
         starts = np.array([r.states[0][position] for r in episodes], np.float64)
         goals = np.array([r.target[position] for r in episodes], np.float64)
-        # Observations are rounded to float32: a point at the allowed distance from a wall is free.
-        radius = ROBOT_RADIUS - 1e-3
         pairs = zip(starts, goals, strict=True)
         return {
             "episode": np.arange(len(episodes)),
@@ -268,7 +270,7 @@ class Study:
             "start_y": starts[:, 1],
             "goal_x": goals[:, 0],
             "goal_y": goals[:, 1],
-            "geodesic": np.array([geodesic_distance(self.maze, s, g, radius) for s, g in pairs]),
+            "geodesic": np.array([geodesic_distance(self.maze, s, g, OBSERVED) for s, g in pairs]),
             "success": np.array([int(r.success) for r in episodes]),
             "length": np.array([r.length for r in episodes]),
             "final_distance": np.array([r.final_distance for r in episodes]),

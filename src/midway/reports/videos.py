@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
@@ -46,6 +46,7 @@ def watch(
     episodes: int = 1,
     seed: int = 0,
     policy: Which = "last",
+    changes: Mapping[str, object] | None = None,
 ) -> Path:
     """Write a video of a trained policy, which acts deterministically.
 
@@ -57,14 +58,15 @@ def watch(
         episodes: Number of episodes, one after the other.
         seed: Seed of starts and goals.
         policy: ``last``, ``best``, or a step whose policy was kept.
+        changes: Settings that the policy acts with, as in `midway.api.load`.
 
     Returns:
         The file.
 
     Raises:
-        ConfigurationError: The folder, policy, task, number or file cannot be used.
+        ConfigurationError: The folder, policy, task, setting, number or file cannot be used.
     """
-    run = read(Path(path), policy)
+    run = read(Path(path), policy, changes)
     task = task or run.config.declaration().shown_task
     out = Path(out or run.folder.path / "videos" / f"{task}.mp4")
     if out.suffix not in RATES:
@@ -80,6 +82,7 @@ def show(
     episodes: int = 1,
     seed: int = 0,
     policy: Which = "last",
+    changes: Mapping[str, object] | None = None,
 ) -> None:
     """Show the same in a window, until the last episode has ended or the window is closed.
 
@@ -89,11 +92,12 @@ def show(
         episodes: As in ``watch``.
         seed: As in ``watch``.
         policy: As in ``watch``.
+        changes: As in ``watch``.
 
     Raises:
         ConfigurationError: As in ``watch``, or there is no display here.
     """
-    run = read(Path(path), policy)
+    run = read(Path(path), policy, changes)
     task = task or run.config.declaration().shown_task
     check_display()
     frames, rate = film(run, task, episodes, seed, RATES[".mp4"])
@@ -110,7 +114,7 @@ def film(
     """
     if episodes < 1:
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
-    policy = policies.load(run.folder, run.weights)
+    policy = policies.load(run.folder, run.weights).using(run.changes)
     (label,) = agent_labels([run.config.agent])
     title = f"{label} on {run.config.env}, {task}"
     make = scenes.maker(run.folder, policy, title)
