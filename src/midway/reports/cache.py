@@ -1,9 +1,9 @@
 """What saved policies do and imagine, computed once; tables of mazes are kept as CSV files."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from midway.reports.runs import Group, RunData
 from midway.runs import policy as policies
 from midway.runs.policy import Policy
 from midway.tables import Table
+from midway.training.evaluate import ActionKind
 
 SEED = 20_210_718
 """Seed of starts and goals in figures: the same for every run, and met in no training."""
@@ -126,15 +127,13 @@ class Study:
     @cached_property
     def recordings(self) -> list[Recording]:
         """Whole episodes of the deterministic policy: many in a maze, a few at a table."""
-        counts = self._counts() if isinstance(self.view, MazeView) else ON_TABLE
-        return record(self.policy, counts, SEED)
+        return self._recorded("mean")
 
     @cached_property
     def decoder(self) -> ImageDecoder | None:
         """What draws the policy's features as images, fitted on the side; None without images."""
-        if decoder.encoder_of(self.policy) is None:
-            return None
-        return decoder.of_policy(self.run.folder, self.policy)
+        seen = decoder.encoder_of(self.policy) is not None
+        return decoder.of_policy(self.run.folder, self.policy) if seen else None
 
     def prepare(self) -> None:
         """Compute what every figure of the policy needs.
@@ -147,10 +146,12 @@ class Study:
         elif isinstance(self.view, TableView):
             assert self.recordings
 
-    def episodes(self) -> list[Episode]:
-        """Return episodes of every task of the deterministic policy in its maze."""
-        table = self._table("episodes", self._episode_table)
-        paths = self._table("paths", self._path_table)
+    def episodes(self, actions: ActionKind = "mean") -> list[Episode]:
+        """Return episodes of every task of the policy in its maze, the same for all its actions."""
+        suffix = "" if actions == "mean" else f"-{actions}"
+        recorded = cache(lambda: self._recorded(actions) if suffix else self.recordings)
+        table = self._table(f"episodes{suffix}", lambda: self._episode_table(recorded()))
+        paths = self._table(f"paths{suffix}", lambda: self._path_table(recorded()))
         bounds = np.searchsorted(paths["episode"], np.arange(len(table["task"]) + 1))
         positions = np.stack([paths["x"], paths["y"]], axis=1)
         return [
@@ -174,7 +175,7 @@ class Study:
             position = self._maze_view.position
             rows = []
             for step, file in weights.items():
-                found = self._policy_of(file).subgoals(start[None], goal[None])
+                found = self._loaded(file).subgoals(start[None], goal[None])
                 parts = [part.achieved_goal[0, position] for part in found]
                 rows.append([step, *np.ravel([start[position], goal[position], *parts])])
             names = ("step", "start_x", "start_y", "goal_x", "goal_y", "x", "y", "scale_x")
@@ -209,11 +210,6 @@ class Study:
 
         return self._table("values", compute)
 
-    def _policy_of(self, weights: Path) -> Policy:
-        if weights == self.run.weights:
-            return self.policy
-        return self._loaded(weights)
-
     def _loaded(self, weights: Path) -> Policy:
         return policies.load(self.run.folder, weights).using(self.run.changes)
 
@@ -223,6 +219,10 @@ class Study:
         chosen = np.linspace(0, len(past) - 1, min(len(past), SNAPSHOTS - 1)).round().astype(int)
         earlier = {step: past[step] for step in np.array(list(past))[chosen].tolist()}
         return {**earlier, self.run.policy_step: self.run.weights}
+
+    def _recorded(self, actions: ActionKind) -> list[Recording]:
+        counts = self._counts() if isinstance(self.view, MazeView) else ON_TABLE
+        return record(self.policy, counts, SEED, actions=actions)
 
     def _counts(self) -> dict[str, int]:
         """Return the number of episodes of each task: more where they are short."""
@@ -258,8 +258,8 @@ class Study:
             tables.write(path, compute())
         return tables.read(path)
 
-    def _episode_table(self) -> Table:
-        position, episodes = self._maze_view.position, self.recordings
+    def _episode_table(self, episodes: Sequence[Recording]) -> Table:
+        position = self._maze_view.position
         starts = np.array([r.states[0][position] for r in episodes], np.float64)
         goals = np.array([r.target[position] for r in episodes], np.float64)
         pairs = zip(starts, goals, strict=True)
@@ -277,9 +277,9 @@ class Study:
             "flipped": np.array([int(is_flipped(self._maze_view, r)) for r in episodes]),
         }
 
-    def _path_table(self) -> Table:
+    def _path_table(self, episodes: Sequence[Recording]) -> Table:
         position = self._maze_view.position
-        paths = [_thinned(r.states[:, position].astype(np.float64)) for r in self.recordings]
+        paths = [_thinned(r.states[:, position].astype(np.float64)) for r in episodes]
         episode = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
         x, y = np.concatenate(paths).T
         return {"episode": episode, "x": x, "y": y}
