@@ -158,8 +158,15 @@ def evaluate(
     """
     from midway import api
 
-    options = {"task": task, "actions": actions, "seed": seed, "policy": policy}
-    result = api.evaluate(run, episodes=episodes, changes=settings(set), **options)
+    result = api.evaluate(
+        run,
+        episodes=episodes,
+        task=task,
+        actions=actions,
+        seed=seed,
+        policy=policy,
+        changes=settings(set),
+    )
     if json:
         episodes_json = [dataclasses.asdict(episode) for episode in result.episodes]
         print_json(
