@@ -68,9 +68,9 @@ test-lowest:
 wheel: $(VENV)/installed
 	$(BIN)/python -m build --outdir dist .
 
-# Builds both, and uses the wheel outside the checkout as a newcomer would.
+# Builds both, and uses the wheel outside the checkout as a newcomer would; LEAP's autoencoders in all environments.
 release-check: $(VENV)/installed
-	$(BIN)/pytest tests/test_release.py
+	$(BIN)/pytest -m release tests/test_release.py tests/training/test_pretrain.py
 
 # After `pip install --upgrade` and `make test-all`: what constraints.txt is to hold.
 tested: $(VENV)/installed-extras

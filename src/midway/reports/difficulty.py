@@ -79,7 +79,7 @@ def draw(rows: Mapping[ActionKind, Results], cases: Sequence[str]) -> Figure:
         for panel in panels:
             style.success_axis(panel)
         if len(rows) > 1:
-            panels[0].set_ylabel(f"success (%), {KINDS[kind]}")
+            panels[0].set_ylabel(f"success, {KINDS[kind]}", fontsize=style.TEXT)
     style.legend_below(figure, [_entry(group, seeds) for group, seeds in results.values()])
     return figure
 
