@@ -154,7 +154,7 @@ def test_a_loss_that_is_not_finite_ends_the_stage(tmp_path: Path) -> None:
 
 # --- what the autoencoder keeps -------------------------------------------------------------------
 
-ROUNDS, STATES = 20, 5_000
+ROUNDS, STATES = 10, 5_000
 """Of training in tests, fewer than in any preset; `benchmarks/autoencoder.py` measures presets."""
 
 FAST = ("point-u", "ant-u", "push-state")
@@ -168,15 +168,16 @@ def kept_settings(env: str, preset: str) -> dict[str, Any]:
     return {n: v for n, v in config.items() if n.startswith(("vae", "latent")) and n not in amounts}
 
 
-def last_round(env: str, settings: Mapping[str, Any], tmp_path: Path) -> dict[str, float]:
-    """Return the errors of held-out states after a short training."""
+def held_out(env: str, settings: Mapping[str, Any], tmp_path: Path, metric: str) -> float:
+    """Return an error of held-out states, the median of the last rounds: it moves up and down."""
     config = leap.Config(hidden=(8,), **settings)
     ability = leap.AGENT.pretrain
     assert ability is not None
     make = partial(midway.make_vec, env)
     start = leap.create(config, make(1).goal_spec, jax.random.key(0))
     pretrain.run(ability, start, lambda n, t: make(n, task=t), 0, tmp_path, lambda text: None)
-    return {name: float(value) for name, value in rows(tmp_path / "pretraining.csv")[-1].items()}
+    last = rows(tmp_path / "pretraining.csv")[-5:]
+    return float(np.median([float(row[f"vae/held_out_{metric}"]) for row in last]))
 
 
 @pytest.mark.parametrize("env", [name for name in ENVIRONMENTS if name != "push"])
@@ -196,10 +197,10 @@ def test_presets_differ_in_how_long_the_autoencoder_learns_alone(env: str) -> No
 def test_the_autoencoder_keeps_where_things_are(env: str, tmp_path: Path) -> None:
     """A subgoal is worth planning for if it is off by less than what counts as reached."""
     amounts = {"vae_rounds": ROUNDS, "vae_states": STATES}
-    found = last_round(env, kept_settings(env, "quick") | amounts, tmp_path)
+    found = held_out(env, kept_settings(env, "quick") | amounts, tmp_path, "distance")
     task = midway.make_vec(env).goal_spec.task
     assert isinstance(task, DistanceTask)
-    assert found["vae/held_out_distance"] < task.threshold / 2
+    assert found < task.threshold / 2
 
 
 @pytest.mark.release
@@ -208,12 +209,12 @@ def test_the_autoencoder_keeps_most_of_an_image(tmp_path: Path) -> None:
     amounts = {"vae_rounds": 4, "vae_states": 1_000}
     settings = kept_settings("push", "quick") | amounts
     assert settings == kept_settings("push", "paper") | amounts
-    found = last_round("push", settings, tmp_path)
+    found = held_out("push", settings, tmp_path, "error")
     env = midway.make_vec("push", 50)
     states = pretrain.sample_states(env, PretrainSettings((), 200, 4, 1), 1).observation
     images = np.asarray(states) / 255
     of_the_mean = ((images - images.mean(0)) ** 2).sum((1, 2, 3)).mean()
-    assert found["vae/held_out_error"] < of_the_mean / 2
+    assert found < of_the_mean / 2
 
 
 # --- whole runs of agents that remember -----------------------------------------------------------

@@ -35,8 +35,9 @@ def begin(
     if agent.memory is None:
         return ()
     memory = agent.memory.begin(config, spec, num_episodes)
-    known = ways is not None and agent.memory.adapt is not None
-    return agent.memory.adapt(config, memory, ways) if known else memory
+    if ways is None or agent.memory.adapt is None:
+        return memory
+    return agent.memory.adapt(config, memory, ways)
 
 
 def act(
