@@ -96,10 +96,10 @@ def _imagined_picture(runs: Runs, group: Group, study: Study) -> Picture:
         + f" of {group.label}, on random and on hard configurations.",
         "What the decoded state and goal do not show, the policy hardly knows: look for the puck."
         + (
-            " A subgoal that is a state decodes to a whole image and has a number around 1. Draws are "
-            "farther from states than the mean where the subgoal policy is wide, for it spreads each "
-            "feature by itself. The prior is averaged over draws; the mean is only the baseline of "
-            "the advantage."
+            " A subgoal that is a state decodes to a whole image and has a number around 1. Draws "
+            "are farther off than the mean where the subgoal policy is wide, for it spreads each "
+            "feature by itself. The prior is averaged over draws; the mean is only the baseline "
+            "of the advantage."
             if imagines
             else ""
         ),
