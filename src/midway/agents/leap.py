@@ -114,7 +114,7 @@ def subgoals_of(state: State, latent: Float[Array, "*B L"]) -> Subgoal:
 
 
 def planned(state: State, memory: Memory) -> Float[Array, "B N G"]:
-    """Return the plans as achieved goals in the environment's units, the first for those before."""
+    """Return the plans as achieved goals (environment's units); what is left out is the first."""
     numbers = jnp.maximum(jnp.arange(state.config.num_subgoals), memory.first[:, None])
     latents = jnp.take_along_axis(memory.latents, numbers[..., None], axis=1)
     return state.encoder.states(subgoals_of(state, latents).achieved_goal)
