@@ -79,6 +79,9 @@ class EpisodeMemory(Generic[ConfigT, StateT]):
             is computed for them; None where a step costs the same anyway.
         plan: ``(state, memory) -> subgoals (B, N, G)`` that the episodes follow, as achieved
             goals in the environment's units; None for an agent that plans none.
+        adapt: ``(config, memory, ways) -> memory`` before the first step, where it is known how
+            far the goals are: ``ways (B,)`` are shares of the environment's longest way. None for
+            an agent that needs not know.
     """
 
     begin: Callable[[ConfigT, EnvSpec, int], Memory]
@@ -87,6 +90,7 @@ class EpisodeMemory(Generic[ConfigT, StateT]):
     ]
     rest: Callable[[Memory, Bool[AnyArray, " B"]], Memory] | None = None
     plan: Callable[[StateT, Memory], Float[Array, "B N G"]] | None = None
+    adapt: Callable[[ConfigT, Memory, Float[AnyArray, " B"]], Memory] | None = None
 
 
 @dataclass(frozen=True)
@@ -156,6 +160,8 @@ class Agent(Generic[ConfigT, StateT]):
         pretrain: What it learns before the first update, if anything.
         sampling: ``config -> Sampling``: what it wants of a batch; None for plain transitions.
         freezing: How its image encoder is frozen; None if it reads no images.
+        test_settings: Settings that a trained policy may be given other values of: those that its
+            networks and what they learned do not depend on.
     """
 
     Config: type[ConfigT]
@@ -169,6 +175,7 @@ class Agent(Generic[ConfigT, StateT]):
     pretrain: Pretrain[ConfigT, StateT] | None = None
     sampling: Callable[[ConfigT], Sampling] | None = None
     freezing: Freezing[StateT] | None = None
+    test_settings: tuple[str, ...] = ()
 
 
 AnyAgent: TypeAlias = Agent[Any, Any]

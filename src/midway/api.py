@@ -163,18 +163,22 @@ def resume(
         return _run_locked(config, folder, setup, (progress, callbacks), number)
 
 
-def load(path: str | Path, policy: Which = "last") -> Policy:
+def load(
+    path: str | Path, policy: Which = "last", changes: Mapping[str, object] | None = None
+) -> Policy:
     """Return the policy of a run: ``policy(observation, goal) -> action``.
 
     Args:
         path: The run folder.
         policy: ``last``, ``best``, or an environment step whose policy was kept.
+        changes: Settings that the policy acts with, as in `Policy.using`.
 
     Raises:
-        ConfigurationError: The folder holds no such policy, or a damaged or foreign one.
+        ConfigurationError: The folder holds no such policy, or a damaged or foreign one, or a
+            setting may not change after training.
     """
     folder = RunFolder.at(path)
-    return policies.load(folder, kept.weights_of(folder, policy))
+    return policies.load(folder, kept.weights_of(folder, policy)).using(changes or {})
 
 
 def evaluate(
@@ -185,6 +189,7 @@ def evaluate(
     actions: ActionKind = "mean",
     seed: int = 0,
     policy: Which = "last",
+    changes: Mapping[str, object] | None = None,
 ) -> Evaluation:
     """Run episodes of a trained policy.
 
@@ -196,13 +201,14 @@ def evaluate(
         actions: ``mean`` or ``sampled``.
         seed: Seed of starts and goals, which no training meets.
         policy: As in `load`.
+        changes: As in `load`.
 
     Raises:
-        ConfigurationError: The folder, policy, task or number of episodes cannot be used.
+        ConfigurationError: The folder, policy, task, setting or number of episodes cannot be used.
     """
     if episodes < 1:
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
-    loaded = load(path, policy)
+    loaded = load(path, policy, changes)
     declared = loaded.config.declaration()
     task = task or declared.shown_task
     env = declared.factory(num_envs=episodes, task=task)

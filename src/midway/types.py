@@ -270,6 +270,10 @@ class VectorGoalEnv(Protocol):
         """Ask no more of these copies, whose episodes are over, until they are reset."""
         ...
 
+    def ways(self) -> Float[NumPyArray, " num_envs"]:
+        """Return how far the goals are, as shares of the longest way; ones where not known."""
+        ...
+
     def state_dict(self) -> dict[str, NumPyArray]:
         """Return all that the future depends on."""
         ...

@@ -222,6 +222,30 @@ def test_episodes_at_different_times_plan_on_their_own(monkeypatch):
     assert left.T.tolist() == [[2, 1, 0], [0, 2, 1], [1, 0, 2]]
 
 
+def test_shorter_ways_have_their_share_of_the_subgoals():
+    ant = leap.Config()
+    # Of case 10 of the S maze, 4.5 of 30.2 m: 11 * 0.149 = 1.6; of half the way: 5.5.
+    ways = np.array([0.0, 4.5 / 30.2, 0.5, 0.97, 1.0])
+    memory = leap.adapt(ant, leap.begin(ant, SPECS["states"], 5), ways)
+    assert (11 - memory.first).tolist() == [1, 2, 6, 11, 11]
+    fixed = replace(ant, adapt_subgoals=False)
+    assert leap.adapt(fixed, leap.begin(fixed, SPECS["states"], 5), ways).first.tolist() == [0] * 5
+
+
+def test_an_episode_with_fewer_subgoals_aims_at_its_goal_earlier(monkeypatch):
+    state = planner(SMALL)
+    memory = leap.begin(SMALL, SPECS["states"], 2)
+    memory = leap.adapt(SMALL, memory, np.array([0.3, 0.6]))
+    plans, aims, left, memory = follow(state, memory, 8, monkeypatch)
+    assert plans.T.tolist() == [[1] * 8, [1, 1, 1, 2, 2, 2, 2, 2]]
+    assert aims.T.tolist() == [[1, 1, 1, 9, 9, 9, 9, 9], [1, 1, 1, 2, 2, 2, 9, 9]]
+    assert left.T.tolist() == 2 * [[2, 1, 0, 2, 1, 0, 2, 1]]
+    # What is drawn of a plan holds no subgoal that was left out.
+    memory = memory._replace(latents=jnp.arange(12.0).reshape(2, 3, 2))
+    shown = leap.AGENT.memory.plan(state, memory)[:, :, 0]
+    assert shown.tolist() == [[4, 4, 4], [8, 8, 10]]
+
+
 def test_exploration_is_the_tdm_without_a_plan():
     state = create(SMALL, SPECS["states"])
     memory = leap.begin(SMALL, SPECS["states"], 4)

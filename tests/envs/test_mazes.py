@@ -5,7 +5,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from midway.envs.geodesic import distance_field, geodesic_distance, way_left
+from midway.envs.geodesic import distance_field, geodesic_distance, shares_of_hard, way_left
 from midway.envs.mazes import MAZES, Rectangle
 from midway.errors import ConfigurationError
 
@@ -113,6 +113,17 @@ def test_distances_of_the_test_cases(name, task, straight, shortest):
         assert np.linalg.norm(goal - start) == pytest.approx(straight, abs=0.05)
     # 1 %: the figures were measured on a grid; ours are exact for the rectangles grown by 0.75.
     assert geodesic_distance(maze, start, goal) == pytest.approx(shortest, rel=0.01)
+
+
+def test_ways_are_shares_of_the_hard_tasks():
+    maze = MAZES["s"]
+    start = centre(maze.cases["hard"].start)
+    goals = [centre(maze.cases[task].goal) for task in ("hard", "case-10", "case-13")]
+    shares = shares_of_hard(maze, np.stack(3 * [start]), np.stack(goals))
+    np.testing.assert_allclose(shares, [1, 4.5 / 30.2, 15.1 / 30.2], atol=0.005)
+    corner, wall = np.array((-3.0, 8.25)), np.array((0.0, 0.0))
+    pairs = np.stack([corner, wall]), np.stack([np.array((3.0, 8.25)), corner])
+    assert shares_of_hard(MAZES["u"], *pairs).tolist() == [1, 1]
 
 
 def test_distance_around_one_wall_worked_by_hand():

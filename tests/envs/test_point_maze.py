@@ -85,6 +85,14 @@ def test_the_test_task_can_be_solved_in_time(shape):
     assert reached.all()
 
 
+def test_environments_know_how_far_their_goals_are():
+    env = make_vec("point-s", 2)
+    env.reset(seed=0, options={"task": "case-10"})
+    np.testing.assert_allclose(env.ways(), 4.5 / 30.2, atol=0.04)
+    env.reset(seed=0, options={"task": "hard"})
+    np.testing.assert_allclose(env.ways(), 1, atol=0.04)
+
+
 def test_an_episode_that_stands_still_is_cut_off_at_its_limit():
     env = make_vec("point-s", 2)
     env.reset(seed=0)

@@ -42,12 +42,22 @@ def test_rows_of_images_are_those_of_the_environment(image_run, quick_decoder):
     decode = decoder.of_policy(RunFolder(image_run), loaded)
     rows = images.rows(loaded, decode, "hard", 2, seed=3)
     observation, _ = make_vec("push", num_envs=2, task="hard").reset(seed=3)
-    np.testing.assert_array_equal(rows["state"], observation["observation"])
-    np.testing.assert_array_equal(rows["goal"], observation["desired_goal"])
-    assert len(rows) == 6
-    for shown in rows.values():
-        assert shown.shape == (2, 84, 84, 3)
-        assert shown.dtype == np.uint8
+    np.testing.assert_array_equal(rows["state,\nand decoded"][0], observation["observation"])
+    np.testing.assert_array_equal(rows["goal,\nand decoded"][0], observation["desired_goal"])
+    assert len(rows) == 2 + 1 + images.DRAWN
+    for left, right, notes in rows.values():
+        assert left.shape == right.shape == (2, 84, 84, 3)
+        assert left.dtype == right.dtype == np.uint8
+        assert len(notes) == 2
+
+
+@needs_renderer
+def test_the_nearest_image_of_an_image_is_itself(image_run, quick_decoder):
+    loaded = api.load(image_run)
+    real = decoder.real_images(loaded)[[3, 35]]
+    found, notes = images.Album(loaded).nearest(decoder.features(loaded, real))
+    np.testing.assert_array_equal(found, real)
+    assert notes == ["0.0", "0.0"]
 
 
 @needs_renderer

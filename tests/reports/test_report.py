@@ -13,14 +13,14 @@ import pytest
 from midway.envs.mazes import MAZES
 from midway.envs.registry import entry
 from midway.envs.views import MazeView
-from midway.reports import cache, compose, failures, images, maze, report
+from midway.reports import cache, compose, difficulty, failures, images, maze, report
 from midway.reports.cache import Episode, Study, is_flipped
 from midway.reports.curves import success_curve
 from midway.reports.difficulty import bins
 from midway.reports.health import PANELS, with_speed
 from midway.reports.imagined import density, halvings
 from midway.reports.recordings import Recording
-from midway.reports.runs import groups
+from midway.reports.runs import by_environment, groups
 from midway.runs.folder import write_json
 from midway.types import DistanceTask
 
@@ -226,6 +226,23 @@ def test_difficulty_bins_hold_as_many_episodes_in_order_of_distance():
     lengths = [5.0, 1.0, 9.0, 2.0, 7.0, 7.0, 3.0, 8.0, 4.0, 6.0, 10.0, 11.0]
     episodes = [Episode("uniform", np.zeros((1, 2)), np.zeros(2), True, d) for d in lengths]
     assert bins(episodes).tolist() == [2, 0, 4, 0, 3, 3, 1, 4, 1, 2, 5, 5]
+
+
+def test_sampled_actions_have_a_row_of_their_own(ris_run, single):
+    (runs,) = by_environment([compose.read(ris_run)])
+    cached = cache.Cache(single[0].parent / "data")
+    (picture,) = difficulty.figures(runs, cached, ("mean", "sampled"))
+    labels = [axes.get_ylabel() for axes in picture.draw().axes]
+    assert labels == ["success, deterministic", "success, with sampled actions"]
+    (study,) = cached.studies(runs.groups[0])
+    mean, sampled = study.episodes(), study.episodes("sampled")
+    assert [(e.task, e.geodesic, *e.goal) for e in mean] == [
+        (e.task, e.geodesic, *e.goal) for e in sampled
+    ]
+    assert any(
+        len(a.path) != len(b.path) or (a.path != b.path).any()
+        for a, b in zip(mean, sampled, strict=True)
+    )
 
 
 def test_density_of_a_laplace_subgoal():

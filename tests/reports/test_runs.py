@@ -2,10 +2,13 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
+from midway import api
 from midway.errors import ConfigurationError
 from midway.reports import report
+from midway.reports.cache import Study
 from midway.reports.runs import groups, read
 from midway.tables import read as read_table
 
@@ -40,6 +43,34 @@ def test_a_table_without_rows_has_no_columns(tmp_path, text):
     file.write_text(text)
     assert read_table(file) == {}
     assert read_table(tmp_path / "missing.csv") == {}
+
+
+def test_plans_have_as_many_subgoals_as_are_asked_for(leap_run, tmp_path):
+    two, three = ({"num_subgoals": "2"}, {"num_subgoals": 3})
+    seen = [Study(read(leap_run, changes=changes), tmp_path) for changes in ({}, two, three)]
+    plans = [study.plan() for study in seen]
+    assert [len(plan["x"]) for plan in plans] == [3, 2, 3]
+    # The tables of one number are not taken for those of another, however it is written.
+    assert len(list(tmp_path.glob("*-plan.csv"))) == 2
+    assert seen[1].where.endswith(", num_subgoals 2")
+    assert seen[1].policy.config.hyperparameters.num_subgoals == 2
+    np.testing.assert_array_equal(plans[0]["x"], plans[2]["x"])
+
+
+@pytest.mark.parametrize(
+    ("run", "name", "text"),
+    [
+        ("ris_run", "num_subgoals", "'num_subgoals' of ris may not change after training: it has"),
+        ("sac_run", "discount", "'discount' of sac may not change after training: it has none"),
+        ("leap_run", "latent_size", "'latent_size' of leap .* use one of num_subgoals, adapt_"),
+        ("leap_run", "num_subgoals", "num_subgoals 0: must be at least 1"),
+    ],
+)
+def test_other_settings_do_not_change_after_training(run, name, text, request):
+    path = request.getfixturevalue(run)
+    for use in (read, api.load):
+        with pytest.raises(ConfigurationError, match=text):
+            use(path, changes={name: 0})
 
 
 def test_seeds_are_one_group_and_settings_another(ris_run, sac_run):

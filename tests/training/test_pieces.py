@@ -167,6 +167,9 @@ class Line:
     def rest(self, mask: Any) -> Any:
         return self.reset(options={"reset_mask": mask})[0]
 
+    def ways(self) -> Any:
+        return np.ones(self.num_envs)
+
 
 def test_evaluation_records_the_first_episode_of_every_environment() -> None:
     result = run_episodes(Line(5), lambda o, g: np.zeros((5, 1)), "near", "mean", seed=0)

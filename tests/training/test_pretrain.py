@@ -1,6 +1,8 @@
 """The stage before training: states, networks on disk, reuse; and agents that remember, whole."""
 
 import csv
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +13,16 @@ import pytest
 from safetensors.numpy import load_file
 
 import midway
-from midway import api
+from drawing_here import needs_renderer
+from midway import api, presets
 from midway.agent import PretrainSettings
 from midway.agents import leap, tdm
+from midway.envs.registry import ENVIRONMENTS
 from midway.errors import ConfigurationError, NonFiniteError
 from midway.runs.folder import RunFolder
 from midway.training import pretrain, state
 from midway.training.evaluate import rollout
+from midway.types import DistanceTask
 
 TINY: dict[str, Any] = {
     "hidden": (8, 8),
@@ -145,6 +150,71 @@ def test_a_loss_that_is_not_finite_ends_the_stage(tmp_path: Path) -> None:
     assert ability is not None
     with pytest.raises(NonFiniteError, match=r"became nan in round 1 of pre-training"):
         pretrain.run(ability, start, lambda n, t: env, 0, tmp_path, lambda text: None)
+
+
+# --- what the autoencoder keeps -------------------------------------------------------------------
+
+ROUNDS, STATES = 10, 5_000
+"""Of training in tests, fewer than in any preset; `benchmarks/autoencoder.py` measures presets."""
+
+FAST = ("point-u", "ant-u", "push-state")
+"""One environment of each family; the others are measured before a release."""
+
+
+def kept_settings(env: str, preset: str) -> dict[str, Any]:
+    """Return what an autoencoder of a preset is made of, but how long it learns."""
+    config = vars(api.configure(env, "leap", preset).hyperparameters)
+    amounts = ("vae_rounds", "vae_states", "vae_source")
+    return {n: v for n, v in config.items() if n.startswith(("vae", "latent")) and n not in amounts}
+
+
+def held_out(env: str, settings: Mapping[str, Any], tmp_path: Path, metric: str) -> float:
+    """Return an error of held-out states, the median of the last rounds: it moves up and down."""
+    config = leap.Config(hidden=(8,), **settings)
+    ability = leap.AGENT.pretrain
+    assert ability is not None
+    make = partial(midway.make_vec, env)
+    start = leap.create(config, make(1).goal_spec, jax.random.key(0))
+    pretrain.run(ability, start, lambda n, t: make(n, task=t), 0, tmp_path, lambda text: None)
+    last = rows(tmp_path / "pretraining.csv")[-5:]
+    return float(np.median([float(row[f"vae/held_out_{metric}"]) for row in last]))
+
+
+@pytest.mark.parametrize("env", [name for name in ENVIRONMENTS if name != "push"])
+def test_presets_differ_in_how_long_the_autoencoder_learns_alone(env: str) -> None:
+    first, *others = (kept_settings(env, preset) for preset in presets.NAMES)
+    assert all(other == first for other in others)
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        pytest.param(name, marks=() if name in FAST else pytest.mark.release)
+        for name in ENVIRONMENTS
+        if name != "push"
+    ],
+)
+def test_the_autoencoder_keeps_where_things_are(env: str, tmp_path: Path) -> None:
+    """A subgoal is worth planning for if it is off by less than what counts as reached."""
+    amounts = {"vae_rounds": ROUNDS, "vae_states": STATES}
+    found = held_out(env, kept_settings(env, "quick") | amounts, tmp_path, "distance")
+    task = midway.make_vec(env).goal_spec.task
+    assert isinstance(task, DistanceTask)
+    assert found < task.threshold
+
+
+@pytest.mark.release
+@needs_renderer
+def test_the_autoencoder_keeps_most_of_an_image(tmp_path: Path) -> None:
+    amounts = {"vae_rounds": 4, "vae_states": 1_000}
+    settings = kept_settings("push", "quick") | amounts
+    assert settings == kept_settings("push", "paper") | amounts
+    found = held_out("push", settings, tmp_path, "error")
+    env = midway.make_vec("push", 50)
+    states = pretrain.sample_states(env, PretrainSettings((), 200, 4, 1), 1).observation
+    images = np.asarray(states) / 255
+    of_the_mean = ((images - images.mean(0)) ** 2).sum((1, 2, 3)).mean()
+    assert found < of_the_mean / 2
 
 
 # --- whole runs of agents that remember -----------------------------------------------------------

@@ -46,6 +46,9 @@ class Lengths:
     def rest(self, mask: Any) -> Any:
         return self.reset(options={"reset_mask": mask})[0]
 
+    def ways(self) -> Any:
+        return np.ones(self.num_envs)
+
 
 class Still:
     """A policy that does nothing and remembers what it is told of finished episodes."""
@@ -94,7 +97,7 @@ def test_a_policy_that_knows_no_rest_is_rolled_out_too() -> None:
 
 
 def test_leap_makes_no_plan_for_episodes_that_are_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each plan is counted as it is made: those of running episodes and no more."""
+    """Each plan is counted as it is made: those of running episodes, fewer on a short way."""
     plans = 0
 
     def counted(
@@ -112,22 +115,25 @@ def test_leap_makes_no_plan_for_episodes_that_are_over(monkeypatch: pytest.Monke
     config = leap.Config(hidden=(8,), num_subgoals=3, latent_size=2, vae_hidden=(8,))
     state = leap.create(config, spec, jax.random.key(0))
     steps = leap.segment_steps(config, spec)
-    lengths = (1, steps, steps + 1, 2 * steps + 1)
+    lengths = (1, steps, steps + 1, 2 * steps + 1, 2 * steps + 1)
 
     class Points(Lengths):
         def observe(self) -> Any:
             zeros = np.zeros((self.num_envs, *spec.observation_shape), np.float32)
             return {"observation": zeros, "desired_goal": zeros}
 
+        def ways(self) -> Any:
+            return np.array([1.0, 1.0, 1.0, 1.0, 0.3])
+
     def act(memory: Any, observation: Any, goal: Any, key: Any) -> Any:
         return acting.act(leap.AGENT, state, memory, observation, goal, key, explore=False)
 
-    def begin(count: int) -> Any:
-        return acting.begin(leap.AGENT, config, spec, count)
+    def begin(count: int, ways: Any) -> Any:
+        return acting.begin(leap.AGENT, config, spec, count, ways)
 
     env = Points(*lengths)
     actor = acting.Actor(leap.AGENT, jax.jit(act), begin, jax.random.key(0))
     assert len(list(rollout(env, actor, env.observe()))) == max(lengths)
     jax.effects_barrier()
     # One plan at the start of each segment that an episode reaches, but for the last segment.
-    assert plans == sum(min(3, -(-length // steps)) for length in lengths) == 7
+    assert plans == sum(min(3, -(-length // steps)) for length in lengths[:-1]) + 1 == 8

@@ -37,7 +37,7 @@ class Settings:
     layer_norm: bool = setting(False, "none", "in the critics")
     normalise: bool = setting(False, "none", "states by the environment's center and spread")
     goal_inputs: GoalInputs = setting("whole", "none", "of the networks", choices=GOAL_INPUTS)
-    policy_every: int = setting(1, "table 1", "updates for each of the policy", least=1)
+    policy_every: int = setting(1, "code of RIS", "updates for each of the policy", least=1)
     network: str = setting("", "none", "module:function that makes networks; nothing: an MLP")
     failure_cost: float = setting(1.0, "ours", "of a failed episode, times 1 / (1 - γ)", least=0)
 
@@ -46,7 +46,9 @@ class Settings:
 class SubgoalSettings(Settings):
     """Settings of RIS beyond the paper; with the defaults there are none."""
 
-    subgoal_every: int = setting(1, "table 1", "updates for each of the subgoal policy", least=1)
+    subgoal_every: int = setting(
+        1, "code of RIS", "updates for each of the subgoal policy", least=1
+    )
     candidates_per_pair: int = setting(1, "one, all in one softmax", "subgoals weighed", least=1)
     candidate_pairs: int = setting(32, "none", "rows with candidates of their own", least=1)
 

@@ -3,7 +3,8 @@
 A LEAP is a `midway.agents.tdm` with an autoencoder of states, trained before it, and a planner that
 is used in acting only. The episode's time is divided into equal segments. At the start of each, the
 planner chooses the subgoals at the ends of the segments to come so that the worst of the TDM's
-values along start, subgoals and goal is best; the TDM's policy then aims at the first of them.
+values along start, subgoals and goal is best; the TDM's policy then aims at the first of them. An
+episode with a shorter way begins in a later segment, and so has fewer subgoals.
 """
 
 import dataclasses
@@ -32,7 +33,8 @@ from midway.types import AnyArray, EnvSpec, Metrics, Subgoal
 class Config(tdm.Config):
     """Hyperparameters of LEAP, those of TDM included; the defaults are those of the ant."""
 
-    num_subgoals: int = setting(11, "table 2", "of a plan at the start of an episode", least=1)
+    num_subgoals: int = setting(11, "table 2", "of a plan for the longest way", least=1)
+    adapt_subgoals: bool = setting(True, "appendix D", "plans for shorter ways have their share")
     latent_size: int = setting(8, "appendix D", "latent numbers of a subgoal", least=1)
     vae_hidden: tuple[int, ...] = setting((64, 128, 64), "appendix D", "of the encoder", least=1)
     vae_kl_weight: float = setting(
@@ -65,6 +67,8 @@ class State(tdm.State):
 NUM_MEASURED = 1_000
 """Held-out states that are reconstructed at the end of each round."""
 
+SEARCH = ("plan_samples", "plan_iterations", "plan_elites", "plan_std")
+
 
 class Memory(NamedTuple):
     """What is remembered of an episode.
@@ -73,11 +77,13 @@ class Memory(NamedTuple):
         explorer: What the TDM remembers, where there is no planning but exploration.
         elapsed: Steps taken.
         latents: The plan: latent numbers of the subgoals at the ends of all segments but the last.
+        first: The segment that the episode begins in; subgoals before it are left out.
     """
 
     explorer: tdm.Memory
     elapsed: Int[Array, " B"]
     latents: Float[Array, "B N L"]
+    first: Int[Array, " B"]
 
 
 # --- time and subgoals ----------------------------------------------------------------------------
@@ -87,6 +93,11 @@ def segment_steps(config: Config, spec: EnvSpec) -> int:
     """Return the steps of a segment: an equal part of the episode, at most the TDM's horizon."""
     equal_part = -(-spec.max_episode_steps // (config.num_subgoals + 1))
     return min(equal_part, config.max_steps_left + 1)
+
+
+def segment_of(state: State, memory: Memory) -> Int[Array, " B"]:
+    """Return the segments that the episodes are in; the last one aims at the goal."""
+    return memory.first + memory.elapsed // segment_steps(state.config, state.spec)
 
 
 def subgoals_of(state: State, latent: Float[Array, "*B L"]) -> Subgoal:
@@ -102,9 +113,11 @@ def subgoals_of(state: State, latent: Float[Array, "*B L"]) -> Subgoal:
     return encoders.as_subgoal(state.spec, decoded)
 
 
-def planned(state: State, memory: "Memory") -> Float[Array, "B N G"]:
-    """Return the subgoals of the running plans, as achieved goals in the environment's units."""
-    return state.encoder.states(subgoals_of(state, memory.latents).achieved_goal)
+def planned(state: State, memory: Memory) -> Float[Array, "B N G"]:
+    """Return the plans as achieved goals (environment's units); what is left out is the first."""
+    numbers = jnp.maximum(jnp.arange(state.config.num_subgoals), memory.first[:, None])
+    latents = jnp.take_along_axis(memory.latents, numbers[..., None], axis=1)
+    return state.encoder.states(subgoals_of(state, latents).achieved_goal)
 
 
 # --- plan -----------------------------------------------------------------------------------------
@@ -171,7 +184,7 @@ def plan_where_due(
 ) -> Float[Array, "B N L"]:
     """Return the plans, made anew where a segment begins that is not the last: one by one."""
     steps = segment_steps(state.config, state.spec)
-    segment = memory.elapsed // steps
+    segment = segment_of(state, memory)
     due = (memory.elapsed % steps == 0) & (segment < state.config.num_subgoals)
 
     def one(row: tuple[Array, ...]) -> Float[Array, "N L"]:
@@ -217,7 +230,7 @@ def pretrain(state: State, states: Subgoal, key: Key[Array, ""]) -> tuple[State,
     state = replace(state, vae=state.vae.standardised(inputs[:num_training]))
     state, metrics = jax.lax.scan(one, state, jax.random.split(key, state.config.vae_updates))
     means = {name: values.mean() for name, values in metrics.items()}
-    return state, means | vae_errors(state, inputs[num_training:][:NUM_MEASURED])
+    return state, means | vaes.errors(state.vae, state.spec, inputs[num_training:][:NUM_MEASURED])
 
 
 def reconstruct(state: State, states: Subgoal) -> Shaped[Array, "N ..."]:
@@ -225,26 +238,15 @@ def reconstruct(state: State, states: Subgoal) -> Shaped[Array, "N ..."]:
     return state.vae.decode(state.vae.encode(encoders.as_vector(state.spec, states)).mean)
 
 
-def vae_errors(state: State, inputs: Shaped[Array, "N ..."]) -> Metrics:
-    """Return the mean error of reconstructed states, and for states that of their distance (m)."""
-    reconstruction = state.vae.decode(state.vae.encode(inputs).mean)
-    errors = {"vae/held_out_error": state.vae.error(inputs, reconstruction).mean()}
-    if not state.spec.is_image:
-        goals = slice(-state.spec.goal_shape[0], None)
-        distance = state.spec.task.distance(reconstruction[:, goals], inputs[:, goals])
-        errors["vae/held_out_distance"] = distance.mean()
-    return errors
-
-
 def update_vae(
     state: State, states: Shaped[Array, "B ..."], key: Key[Array, ""]
 ) -> tuple[State, Metrics]:
     """Return the state after one gradient step of the autoencoder."""
-    noise = jax.random.normal(key, (len(states), state.config.latent_size))
-    old, rate = (state.vae, state.vae_optimizer), state.config.vae_learning_rate
-    vae, vae_optimizer, metrics = optimizer.minimise(
-        vaes.loss, *old, rate, states, noise, state.config.vae_kl_weight
-    )
+    config = state.config
+    noise = jax.random.normal(key, (len(states), config.latent_size))
+    inputs = (config.vae_learning_rate, states, noise, config.vae_kl_weight)
+    old = (vaes.loss, state.vae, state.vae_optimizer)
+    vae, vae_optimizer, metrics = optimizer.minimise(*old, *inputs)
     return replace(state, vae=vae, vae_optimizer=vae_optimizer), metrics
 
 
@@ -257,7 +259,19 @@ def begin(config: Config, spec: EnvSpec, num_episodes: int) -> Memory:
         tdm.begin(config, spec, num_episodes),
         jnp.zeros(num_episodes, jnp.int32),
         jnp.zeros((num_episodes, config.num_subgoals, config.latent_size)),
+        jnp.zeros(num_episodes, jnp.int32),
     )
+
+
+def adapt(config: Config, memory: Memory, ways: Float[AnyArray, " B"]) -> Memory:
+    """Return the memory of new episodes that plan ⌈way · num_subgoals⌉ subgoals, at least one.
+
+    Appendix D has the number "adapted according to the difficulty", not how: the rule is ours.
+    """
+    if not config.adapt_subgoals:
+        return memory
+    number = jnp.clip(jnp.ceil(config.num_subgoals * ways), 1, config.num_subgoals)
+    return memory._replace(first=config.num_subgoals - number.astype(jnp.int32))
 
 
 def act_on(
@@ -291,8 +305,7 @@ def rest(memory: Memory, done: Bool[AnyArray, " B"]) -> Memory:
 
 def aims(state: State, memory: Memory, goal: Float[Array, "B G"]) -> Float[Array, "B G"]:
     """Return the current subgoals, or the goals in the last segment."""
-    segment = memory.elapsed // segment_steps(state.config, state.spec)
-    last = state.config.num_subgoals
+    segment, last = segment_of(state, memory), state.config.num_subgoals
     row = jnp.arange(len(segment))
     subgoal = subgoals_of(state, memory.latents[row, jnp.minimum(segment, last - 1)])
     return jnp.where(segment[:, None] >= last, goal, subgoal.achieved_goal)
@@ -330,7 +343,8 @@ AGENT = Agent(
     act,
     networks=(*tdm.NETWORKS, "vae"),
     value=tdm.AGENT.value,
-    memory=EpisodeMemory(begin, act_on, rest, planned),
+    memory=EpisodeMemory(begin, act_on, rest, planned, adapt),
     pretrain=Pretrain(pretrain_settings, pretrain, reconstruct),
     freezing=Freezing(lambda state: LatentMean(state.vae), at_start=True, kept=("vae",)),
+    test_settings=("num_subgoals", "adapt_subgoals", "prior_weight", *SEARCH),
 )

@@ -119,7 +119,7 @@ def subgoal_cost(state: State, batch: Batch, subgoal: Subgoal) -> Float[Array, "
 def subgoal_advantage(
     state: State, batch: Batch, mean_subgoal: Float[Array, "B S"]
 ) -> Float[Array, " B"]:
-    """Return the cost of the current mean subgoal minus the cost of the candidate (eq. 11)."""
+    """Return the cost of the current mean subgoal minus the cost of the candidate (A of eq. 11)."""
     mean = as_subgoal(state, batch.observation, mean_subgoal)
     return subgoal_cost(state, batch, mean) - subgoal_cost(state, batch, batch.subgoal_candidate)
 
@@ -151,7 +151,7 @@ def policy_loss(
     noise: Float[Array, "B A"],
     imagined: Float[Array, "B I G"],
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Return the mean of α D_KL(π_θ || π_prior) - min Q (eq. 18-19).
+    """Return the mean of α D_KL(π_θ || π_prior) - min Q (eq. 9 of the paper; eq. 18-19).
 
     The divergence is estimated on the action before the tanh, whose Jacobian cancels in it.
     """

@@ -143,6 +143,7 @@ def evaluate(
     actions: Literal["mean", "sampled"] = "mean",
     seed: int = 0,
     policy: Kept = "last",
+    set: tuple[str, ...] = (),
     json: bool = False,
 ) -> None:
     """Run episodes of a trained policy and print how many reach their goal.
@@ -154,12 +155,19 @@ def evaluate(
         actions: Mean or sampled actions.
         seed: Seed of starts and goals.
         policy: The best policy of the run, the last, or that of a step whose policy was kept.
+        set: Settings of acting in place of the run's, as NAME=VALUE, such as num_subgoals=3 (leap).
         json: Print one JSON object, with every episode.
     """
     from midway import api
 
     result = api.evaluate(
-        run, episodes=episodes, task=task, actions=actions, seed=seed, policy=policy
+        run,
+        episodes=episodes,
+        task=task,
+        actions=actions,
+        seed=seed,
+        policy=policy,
+        changes=settings(set),
     )
     if json:
         episodes_json = [dataclasses.asdict(episode) for episode in result.episodes]
@@ -170,6 +178,7 @@ def evaluate(
                 "actions": actions,
                 "seed": seed,
                 "policy": policy,
+                "changes": settings(set),
                 "success_rate": result.success_rate,
                 "interval": result.success[1:],
                 "final_distance": result.final_distance,
@@ -244,7 +253,10 @@ def sweep(
 
 
 def report(
-    runs: Positional[tuple[Path, ...]], out: Path | None = None, policy: Kept = "last"
+    runs: Positional[tuple[Path, ...]],
+    out: Path | None = None,
+    policy: Kept = "last",
+    set: tuple[str, ...] = (),
 ) -> None:
     """Draw figures and one HTML page from run folders.
 
@@ -252,10 +264,11 @@ def report(
         runs: Run folders, or the folder of a sweep.
         out: Folder for the figures; default: figures in the run folder, or report beside the first.
         policy: The policies that are drawn: best, last, or those of a step.
+        set: Settings of acting in place of the run's, as NAME=VALUE, such as num_subgoals=3 (leap).
     """
     from midway import reports
 
-    for path in reports.report(run_folders(runs), out, policy):
+    for path in reports.report(run_folders(runs), out, policy, settings(set)):
         print(path)
 
 
@@ -266,6 +279,7 @@ def watch(
     episodes: Count = 1,
     seed: int = 0,
     policy: Kept = "last",
+    set: tuple[str, ...] = (),
     live: bool = False,
 ) -> None:
     """Write a video of the policy with its imagined subgoals, or show it in a window.
@@ -277,6 +291,7 @@ def watch(
         episodes: Number of episodes.
         seed: Seed of starts and goals.
         policy: The best policy of the run, the last, or that of a step whose policy was kept.
+        set: Settings of acting in place of the run's, as NAME=VALUE, such as num_subgoals=3 (leap).
         live: Show the episodes in a window instead; needs a display.
     """
     from midway import reports
@@ -284,9 +299,9 @@ def watch(
     if live:
         if out is not None:
             raise ConfigurationError(f"--out {out}: --live writes no file")
-        reports.show(run, task=task, episodes=episodes, seed=seed, policy=policy)
+        reports.show(run, task, episodes, seed, policy, settings(set))
         return
-    print(reports.watch(run, out, task=task, episodes=episodes, seed=seed, policy=policy))
+    print(reports.watch(run, out, task, episodes, seed, policy, settings(set)))
 
 
 COMMANDS: dict[str, Callable[..., None]] = {

@@ -12,6 +12,9 @@ CLEARANCE = 1e-6
 """Distance of path corners from grown walls (m), so that paths along a wall do not touch it."""
 
 
+OBSERVED = ROBOT_RADIUS - 1e-3
+"""Distance from walls (m) of points that were drawn free and rounded to float32."""
+
 NARROW = 0.2
 """Distance from walls (m) that no robot in a maze falls below, as it is pressed against one."""
 
@@ -47,6 +50,21 @@ def geodesic_distance(
     if not maze.free(goal, radius):
         distance[:] = np.inf
     return np.asarray(distance.reshape(start.shape[:-1]))
+
+
+def shares_of_hard(
+    maze: Maze, starts: Float[np.ndarray, "n 2"], goals: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, " n"]:
+    """Return the lengths of shortest paths as shares of the hard task's, at most 1.
+
+    The hard task's is that between the middles of its boxes. A way from or to a point at a wall,
+    where no start or goal is drawn, counts as 1.
+    """
+    hard = maze.cases["hard"]
+    ends = np.array([[box.x, box.y] for box in (hard.start, hard.goal)])
+    pairs = zip([ends[0], *starts], [ends[1], *goals], strict=True)
+    longest, *ways = (float(geodesic_distance(maze, *pair, OBSERVED)) for pair in pairs)
+    return np.minimum(1.0, np.array(ways) / longest)
 
 
 def way_left(

@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float, Float32, Int, UInt8
 
+from midway.envs.geodesic import shares_of_hard
 from midway.envs.mazes import WALL_HEIGHT, Maze
 from midway.envs.rendering import Renderer, camera_above
 from midway.envs.simulation import SimulationVectorEnv
@@ -128,6 +129,11 @@ class MazeVectorEnv(SimulationVectorEnv):
             self._renderer = Renderer(self._model, camera_above(arena.x, arena.y, half))
         goals = self._goals["desired_goal"][:, :2].astype(np.float64)
         return tuple(self._renderer.draw(self._qpos, goals))
+
+    def ways(self) -> Float[Array, " num_envs"]:
+        """Return the shortest paths to the goals, as shares of that of the task ``hard``."""
+        here, goals = (each[:, :2] for each in self.success_pair(self._observe()))
+        return shares_of_hard(self.maze, here, goals)
 
     def _achieved(self) -> Observations:
         observation = self._encode(self._qpos, self._qvel)

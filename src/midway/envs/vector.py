@@ -9,7 +9,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from jaxtyping import Bool, Int, Shaped, UInt64
+from jaxtyping import Bool, Float, Int, Shaped, UInt64
 
 from midway.errors import ConfigurationError
 from midway.types import DistanceTask, EnvSpec, Info, NumPyArray, Options, Step
@@ -176,6 +176,13 @@ class GoalVectorEnv(VectorEnv[Observations, Array, Array]):
             The observations of every copy. All are stepped together, so these begin anew.
         """
         return self.reset(options={"reset_mask": mask})[0]
+
+    def ways(self) -> Float[Array, " num_envs"]:
+        """Return how far each copy is from its goal, as a share of the way of the task ``hard``.
+
+        At most 1, which it is everywhere in an environment whose ways are not known.
+        """
+        return np.ones(self.num_envs)
 
     def success_pair(self, observations: Mapping[str, Array]) -> tuple[Array, Array]:
         """Return what success is measured on: the states where there are any, else the goals."""

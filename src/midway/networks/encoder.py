@@ -16,7 +16,7 @@ from midway.networks.mlp import Linear, Precision
 from midway.types import Batch, EnvSpec, Subgoal
 
 NUM_FEATURES = 16
-"""Features of an image (appendix B)."""
+"""Features of an image (appendix D)."""
 
 LARGEST_FEATURE = 5.0
 """Bound of normalised entries: an ant on its back lies 20 deviations off."""
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 CHANNELS = 32
 STRIDES = (2, 2, 2, 1)
-"""Of the four 3 x 3 convolutions (appendix B)."""
+"""Of the four 3 x 3 convolutions (appendix D)."""
 
 SMALLEST_IMAGE = 31
 """Rows and columns that the convolutions make one pixel of."""
@@ -262,7 +262,7 @@ class Sees(Protocol):
 
 
 def candidates(encoder: Encoder, batch: Batch, features: Float[Array, "B S"]) -> Subgoal:
-    """Return the features of the states drawn from replay as subgoal candidates (eq. 17).
+    """Return the features of the states drawn from replay as subgoal candidates (p_s of eq. 17).
 
     For images these are the features of the batch's own observations, each beside another
     transition: as uniform as any draws, and no further pass through the encoder.

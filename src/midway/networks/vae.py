@@ -176,6 +176,17 @@ def loss(
     return total, {"vae/loss": total, "vae/error": error, "vae/kl": kl}
 
 
+def errors(vae: StateVAE | ImageVAE, spec: EnvSpec, states: Shaped[Array, "N ..."]) -> Metrics:
+    """Return the mean error of reconstructed states, and for states that of their distance (m)."""
+    reconstruction = vae.decode(vae.encode(states).mean)
+    found = {"vae/held_out_error": vae.error(states, reconstruction).mean()}
+    if not spec.is_image:
+        goals = slice(-spec.goal_shape[0], None)
+        distance = spec.task.distance(reconstruction[:, goals], states[:, goals])
+        found["vae/held_out_distance"] = distance.mean()
+    return found
+
+
 def _stack(
     channels: int, layers: tuple[tuple[int, int, int], ...], key: Key[Array, ""]
 ) -> tuple[Filter, ...]:

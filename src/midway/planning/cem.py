@@ -21,8 +21,8 @@ def minimise(
     """Return the best candidate of the last iteration and its cost.
 
     Each iteration draws candidates from a diagonal Gaussian and refits it to those of the smallest
-    costs, without smoothing (LEAP, section 4.3 of `environments.md` and the original code). The
-    compiled program is a scan over the iterations.
+    costs, without smoothing (code of LEAP; the appendix says nothing of the search). The compiled
+    program is a scan over the iterations.
 
     Args:
         cost: The cost function, on candidates ``(num_samples, *shape)``.

@@ -1,17 +1,17 @@
 """What saved policies do and imagine, computed once; tables of mazes are kept as CSV files."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from midway import tables
-from midway.envs.geodesic import geodesic_distance
-from midway.envs.mazes import ROBOT_RADIUS, Maze
+from midway.envs.geodesic import OBSERVED, geodesic_distance
+from midway.envs.mazes import Maze
 from midway.envs.views import MazeView
 from midway.errors import BrokenEnvironmentError, ConfigurationError
 from midway.networks.decoder import ImageDecoder
@@ -21,11 +21,12 @@ from midway.reports.runs import Group, RunData
 from midway.runs import policy as policies
 from midway.runs.policy import Policy
 from midway.tables import Table
+from midway.training.evaluate import ActionKind
 
 SEED = 20_210_718
 """Seed of starts and goals in figures: the same for every run, and met in no training."""
 
-VERSION = 3
+VERSION = 4
 """Counted up when the same policy would give other tables."""
 
 STEPS = 30_000
@@ -69,8 +70,8 @@ class Episode:
 class Study:
     """The saved policy of one run: what it does and what it imagines.
 
-    Tables are files, which a second report reads instead; their names hold a digest of the weights,
-    so another policy has other files.
+    Tables are files, which a second report reads instead; their names hold a digest of the weights
+    and of the settings of acting, so another policy has other files.
 
     Args:
         run: A run with a saved policy.
@@ -100,8 +101,9 @@ class Study:
 
     @property
     def where(self) -> str:
-        """The run's seed and the step of its policy, for captions."""
-        return f"seed {self.run.config.seed}, step {self.run.policy_step:,}"
+        """The run's seed, the step of its policy and changed settings, for captions."""
+        changes = "".join(f", {name} {value}" for name, value in self.run.changes.items())
+        return f"seed {self.run.config.seed}, step {self.run.policy_step:,}{changes}"
 
     @cached_property
     def policy(self) -> Policy:
@@ -110,7 +112,7 @@ class Study:
         Raises:
             ConfigurationError: It is damaged or foreign.
         """
-        return policies.load(self.run.folder, self.run.weights)
+        return self._loaded(self.run.weights)
 
     @property
     def maze(self) -> Maze:
@@ -125,16 +127,13 @@ class Study:
     @cached_property
     def recordings(self) -> list[Recording]:
         """Whole episodes of the deterministic policy: many in a maze, a few elsewhere."""
-        if isinstance(self.view, MazeView):
-            return record(self.policy, self._counts(), SEED)
-        return record(self.policy, ELSEWHERE if self.view is None else ON_TABLE, SEED)
+        return self._recorded("mean")
 
     @cached_property
     def decoder(self) -> ImageDecoder | None:
         """What draws the policy's features as images, fitted on the side; None without images."""
-        if decoder.encoder_of(self.policy) is None:
-            return None
-        return decoder.of_policy(self.run.folder, self.policy)
+        seen = decoder.encoder_of(self.policy) is not None
+        return decoder.of_policy(self.run.folder, self.policy) if seen else None
 
     def prepare(self) -> None:
         """Compute what every figure of the policy needs.
@@ -147,10 +146,12 @@ class Study:
         else:
             assert self.recordings
 
-    def episodes(self) -> list[Episode]:
-        """Return episodes of every task of the deterministic policy in its maze."""
-        table = self._table("episodes", self._episode_table)
-        paths = self._table("paths", self._path_table)
+    def episodes(self, actions: ActionKind = "mean") -> list[Episode]:
+        """Return episodes of every task of the policy in its maze, the same for all its actions."""
+        suffix = "" if actions == "mean" else f"-{actions}"
+        recorded = cache(lambda: self._recorded(actions) if suffix else self.recordings)
+        table = self._table(f"episodes{suffix}", lambda: self._episode_table(recorded()))
+        paths = self._table(f"paths{suffix}", lambda: self._path_table(recorded()))
         bounds = np.searchsorted(paths["episode"], np.arange(len(table["task"]) + 1))
         positions = np.stack([paths["x"], paths["y"]], axis=1)
         return [
@@ -174,7 +175,7 @@ class Study:
             position = self._maze_view.position
             rows = []
             for step, file in weights.items():
-                found = self._policy_of(file).subgoals(start[None], goal[None])
+                found = self._loaded(file).subgoals(start[None], goal[None])
                 parts = [part.achieved_goal[0, position] for part in found]
                 rows.append([step, *np.ravel([start[position], goal[position], *parts])])
             names = ("step", "start_x", "start_y", "goal_x", "goal_y", "x", "y", "scale_x")
@@ -209,10 +210,8 @@ class Study:
 
         return self._table("values", compute)
 
-    def _policy_of(self, weights: Path) -> Policy:
-        if weights == self.run.weights:
-            return self.policy
-        return policies.load(self.run.folder, weights)
+    def _loaded(self, weights: Path) -> Policy:
+        return policies.load(self.run.folder, weights).using(self.run.changes)
 
     def _snapshots(self) -> dict[int, Path]:
         """Return weights by step: some of the past, and the newest."""
@@ -220,6 +219,11 @@ class Study:
         chosen = np.linspace(0, len(past) - 1, min(len(past), SNAPSHOTS - 1)).round().astype(int)
         earlier = {step: past[step] for step in np.array(list(past))[chosen].tolist()}
         return {**earlier, self.run.policy_step: self.run.weights}
+
+    def _recorded(self, actions: ActionKind) -> list[Recording]:
+        elsewhere = ELSEWHERE if self.view is None else ON_TABLE
+        counts = self._counts() if isinstance(self.view, MazeView) else elsewhere
+        return record(self.policy, counts, SEED, actions=actions)
 
     def _counts(self) -> dict[str, int]:
         """Return the number of episodes of each task: more where they are short."""
@@ -247,7 +251,7 @@ class Study:
 
     def _table(self, name: str, compute: Callable[[], Table], *weights: Path) -> Table:
         """Return a table from its file, or compute it and write the file."""
-        digest = hashlib.sha256(f"{VERSION} {SEED} {self.maze}".encode())
+        digest = hashlib.sha256(f"{VERSION} {SEED} {self.maze} {self.run.acting}".encode())
         for file in (self.run.weights, *weights):
             digest.update(file.read_bytes())
         path = self._folder / f"{self.run.name}-{digest.hexdigest()[:10]}-{name}.csv"
@@ -255,12 +259,10 @@ class Study:
             tables.write(path, compute())
         return tables.read(path)
 
-    def _episode_table(self) -> Table:
-        position, episodes = self._maze_view.position, self.recordings
+    def _episode_table(self, episodes: Sequence[Recording]) -> Table:
+        position = self._maze_view.position
         starts = np.array([r.states[0][position] for r in episodes], np.float64)
         goals = np.array([r.target[position] for r in episodes], np.float64)
-        # Observations are rounded to float32: a point at the allowed distance from a wall is free.
-        radius = ROBOT_RADIUS - 1e-3
         pairs = zip(starts, goals, strict=True)
         return {
             "episode": np.arange(len(episodes)),
@@ -269,16 +271,16 @@ class Study:
             "start_y": starts[:, 1],
             "goal_x": goals[:, 0],
             "goal_y": goals[:, 1],
-            "geodesic": np.array([geodesic_distance(self.maze, s, g, radius) for s, g in pairs]),
+            "geodesic": np.array([geodesic_distance(self.maze, s, g, OBSERVED) for s, g in pairs]),
             "success": np.array([int(r.success) for r in episodes]),
             "length": np.array([r.length for r in episodes]),
             "final_distance": np.array([r.final_distance for r in episodes]),
             "flipped": np.array([int(is_flipped(self._maze_view, r)) for r in episodes]),
         }
 
-    def _path_table(self) -> Table:
+    def _path_table(self, episodes: Sequence[Recording]) -> Table:
         position = self._maze_view.position
-        paths = [_thinned(r.states[:, position].astype(np.float64)) for r in self.recordings]
+        paths = [_thinned(r.states[:, position].astype(np.float64)) for r in episodes]
         episode = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
         x, y = np.concatenate(paths).T
         return {"episode": episode, "x": x, "y": y}

@@ -1,6 +1,6 @@
 """From run folders to files: the figures and the page."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -49,6 +49,7 @@ def report(
     runs: str | Path | Sequence[str | Path],
     out: str | Path | None = None,
     policy: Which = "last",
+    changes: Mapping[str, object] | None = None,
 ) -> list[Path]:
     """Draw what run folders hold, and one page with all of it.
 
@@ -58,19 +59,20 @@ def report(
             ``report`` beside the first one.
         policy: Whose episodes, subgoals and values are drawn: ``last``, ``best``, or a step whose
             policy was kept.
+        changes: Settings that all these policies act with, as in `midway.api.load`.
 
     Returns:
         The files that were written: the page, then the figures.
 
     Raises:
-        ConfigurationError: A path is no run folder, no run has kept the policy, or ``out`` cannot
-            be written.
+        ConfigurationError: A path is no run folder, no run has kept the policy, a setting may not
+            change after training, or ``out`` cannot be written.
     """
     paths = [Path(run) for run in ([runs] if isinstance(runs, str | Path) else runs)]
     if not paths:
         raise ConfigurationError("no run folder given")
     folders = {path.resolve(): path for path in paths}
-    found = [read(path, policy) for path in folders.values()]
+    found = [read(path, policy, changes) for path in folders.values()]
     _check_kept(found)
     alone = len(found) == 1
     place = found[0].folder.figures if alone else paths[0].resolve().parent / "report"

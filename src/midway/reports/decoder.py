@@ -98,10 +98,15 @@ def digest(policy: Policy, encoder: Encoder) -> UInt8[np.ndarray, " n"]:
 
 def fit(policy: Policy, encoder: Encoder) -> ImageDecoder:
     """Return a decoder fitted to the features of an encoder; the run's seed decides all."""
-    env_seed, key = seeds.decoder(policy.config.seed)
-    env = policy.config.declaration().factory(num_envs=NUM_ENVS)
-    images = jnp.asarray(sample_images(env, IMAGES, env_seed))
+    images = jnp.asarray(real_images(policy))
+    key = seeds.decoder(policy.config.seed)[1]
     return fit_to(_apply(encoder, images), images, key, UPDATES)
+
+
+def real_images(policy: Policy) -> Images:
+    """Return the images that a decoder is fitted to; the run's seed decides which."""
+    env = policy.config.declaration().factory(num_envs=NUM_ENVS)
+    return sample_images(env, IMAGES, seeds.decoder(policy.config.seed)[0])
 
 
 def decoded(
@@ -114,9 +119,14 @@ def decoded(
 
 def reconstructed(policy: Policy, decoder: ImageDecoder, images: Images) -> Images:
     """Return what is left of images after encoding and decoding, uint8."""
+    return decoded(decoder, features(policy, images))
+
+
+def features(policy: Policy, images: Images) -> Float[np.ndarray, "B F"]:
+    """Return what the policy's encoder makes of images."""
     encoder = encoder_of(policy)
     assert encoder is not None
-    return decoded(decoder, _apply(encoder, images))
+    return np.asarray(_apply(encoder, images))
 
 
 def as_images(values: Float[np.ndarray, "B H W 3"]) -> Images:

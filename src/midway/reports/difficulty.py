@@ -15,33 +15,42 @@ from midway.reports.cache import Cache, Episode
 from midway.reports.runs import Group, Runs
 from midway.reports.style import Picture
 from midway.statistics import Estimate, of_agent
+from midway.training.evaluate import ActionKind
 
 BINS = 6
 """Bins of geodesic distance."""
 
 TASKS = ("uniform", "hard")
 
+KINDS: dict[ActionKind, str] = {"mean": "deterministic", "sampled": "with sampled actions"}
+
 Seeds: TypeAlias = list[list[Episode]]
 """Episodes of each seed; starts and goals are the same for every seed."""
 
+Results: TypeAlias = Mapping[str, tuple[Group, Seeds]]
+"""Groups and the episodes of their seeds, by label."""
 
-def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
-    """Yield one figure of all groups with policies, in a maze."""
+
+def figures(runs: Runs, cache: Cache, kinds: Sequence[ActionKind] = ("mean",)) -> Iterator[Picture]:
+    """Yield one figure of all groups with policies, in a maze; a row for each kind of action."""
     if not isinstance(runs.view, MazeView):
         return
-    results = {
-        group.label: (group, [study.episodes() for study in studies])
-        for group in runs.groups
-        if (studies := cache.studies(group))
-    }
-    if not results:
+    found = [(group, studies) for group in runs.groups if (studies := cache.studies(group))]
+    if not found:
         return
+    rows: dict[ActionKind, Results] = {
+        kind: {
+            group.label: (group, [s.episodes(kind) for s in studies]) for group, studies in found
+        }
+        for kind in kinds
+    }
     cases = [name for name in runs.view.maze.cases if name.startswith("case-")]
+    words = " and ".join(KINDS[kind] for kind in kinds)
     yield Picture(
         f"{runs.slug}-difficulty",
-        lambda: draw(results, cases),
+        lambda: draw(rows, cases),
         "Success against difficulty",
-        "The saved deterministic policies, with the same starts and goals for all. Each bin of "
+        f"The saved policies, {words}, with the same starts and goals for all. Each bin of "
         "uniform tasks holds as many episodes. Bars: 95 % intervals, which count seeds and "
         "episodes (bootstrap), or the episodes of a single seed (Wilson).",
         f"Success on {runs.env} by length of the shortest path"
@@ -51,21 +60,26 @@ def figures(runs: Runs, cache: Cache) -> Iterator[Picture]:
     )
 
 
-def draw(results: Mapping[str, tuple[Group, Seeds]], cases: Sequence[str]) -> Figure:
+def draw(rows: Mapping[ActionKind, Results], cases: Sequence[str]) -> Figure:
     """Draw success over the geodesic distance, and over the numbered cases where there are any.
 
     Args:
-        results: Groups and the episodes of their seeds, by label.
+        rows: What each kind of action reached.
         cases: Names of the numbered cases of the maze, by difficulty.
     """
     columns = 2 if cases else 1
     width = style.WIDTH if cases else 0.62 * style.WIDTH
-    figure, axes = style.figure(1, columns, height=3.9, width=width, sharey=True)
-    _draw_bins(axes[0], results)
-    if cases:
-        _draw_cases(axes[1], results, cases)
-    for panel in axes:
-        style.success_axis(panel)
+    height = 0.5 + 3.4 * len(rows)
+    figure, axes = style.figure(len(rows), columns, height=height, width=width, sharey=True)
+    for row, (kind, results) in enumerate(rows.items()):
+        panels = axes[row * columns : (row + 1) * columns]
+        _draw_bins(panels[0], results)
+        if cases:
+            _draw_cases(panels[1], results, cases)
+        for panel in panels:
+            style.success_axis(panel)
+        if len(rows) > 1:
+            panels[0].set_ylabel(f"success, {KINDS[kind]}", fontsize=style.TEXT)
     style.legend_below(figure, [_entry(group, seeds) for group, seeds in results.values()])
     return figure
 
@@ -81,7 +95,7 @@ def summary(successes: Sequence[Bool[np.ndarray, " episodes"]]) -> Estimate:
     return of_agent([float(seed.mean()) for seed in successes], [len(seed) for seed in successes])
 
 
-def _draw_bins(axes: Axes, results: Mapping[str, tuple[Group, Seeds]]) -> None:
+def _draw_bins(axes: Axes, results: Results) -> None:
     """Draw uniform tasks by distance, and the hard task as a hollow mark."""
     for place, (group, seeds) in enumerate(results.values()):
         uniform, hard = ([[e for e in s if e.task == task] for s in seeds] for task in TASKS)
@@ -103,9 +117,7 @@ def _distance(seeds: Seeds) -> float:
     return float(np.mean([episode.geodesic for episode in seeds[0]]))
 
 
-def _draw_cases(
-    axes: Axes, results: Mapping[str, tuple[Group, Seeds]], cases: Sequence[str]
-) -> None:
+def _draw_cases(axes: Axes, results: Results, cases: Sequence[str]) -> None:
     metres = []
     for place, (group, seeds) in enumerate(results.values()):
         points = []

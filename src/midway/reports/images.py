@@ -1,6 +1,7 @@
 """What a policy sees and imagines, as images, and what an autoencoder keeps of states."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import TypeAlias
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
 
 from midway.agent import AgentState, PretrainSettings
 from midway.envs.views import MazeView, TableView
@@ -15,7 +17,14 @@ from midway.networks.decoder import ImageDecoder
 from midway.reports import maze as maps
 from midway.reports import style
 from midway.reports.cache import SEED, Cache, Study
-from midway.reports.decoder import Images, as_images, decoded, reconstructed
+from midway.reports.decoder import (
+    Images,
+    as_images,
+    decoded,
+    features,
+    real_images,
+    reconstructed,
+)
 from midway.reports.recordings import draws
 from midway.reports.runs import Group, Runs
 from midway.reports.style import Picture
@@ -23,14 +32,17 @@ from midway.runs.policy import Policy
 from midway.training.pretrain import sample_states
 from midway.types import NumPyArray, Subgoal
 
-Rows: TypeAlias = Mapping[str, Images]
-"""Images of every configuration, by the name of their row."""
+Rows: TypeAlias = Mapping[str, tuple[Images, Images, Sequence[str]]]
+"""Two images of every configuration and a note below them, by the name of their row."""
 
-SHOWN = {"uniform": 4, "hard": 4}
+SHOWN = {"uniform": 2, "hard": 2}
 """Configurations of each task."""
 
+DRAWN = 3
+"""Subgoals of each configuration that are drawn from the subgoal policy."""
+
 GAP = 0.25
-"""Width between the two tasks, as a share of an image."""
+"""Width between configurations, as a share of an image."""
 
 SIDE = 1.3
 """Width of the names of rows (inches)."""
@@ -72,7 +84,10 @@ def _imagined_picture(runs: Runs, group: Group, study: Study) -> Picture:
         "side turns features into images; the decoded state and goal show how much of an image the "
         "features and the decoder keep."
         + (
-            " Between them: the mean of the subgoal policy and one draw from it, decoded."
+            " Between them, decoded: the mean of the subgoal policy and draws from it, each beside "
+            "the real image whose features are nearest (of starts, goals and after random actions; "
+            "each feature in units of its deviation). The number is their distance, 1 being the "
+            "median from a goal's image to the nearest other."
             if imagines
             else ""
         ),
@@ -80,7 +95,14 @@ def _imagined_picture(runs: Runs, group: Group, study: Study) -> Picture:
         + (" and imagined subgoals" if imagines else "")
         + f" of {group.label}, on random and on hard configurations.",
         "What the decoded state and goal do not show, the policy hardly knows: look for the puck."
-        + (" A sound subgoal lies between the two." if imagines else ""),
+        + (
+            " A subgoal that is a state decodes to a whole image and has a number around 1. Draws "
+            "are farther off than the mean where the subgoal policy is wide, for it spreads each "
+            "feature by itself. The prior is averaged over draws; the mean is only the baseline "
+            "of the advantage."
+            if imagines
+            else ""
+        ),
     )
 
 
@@ -97,26 +119,28 @@ def _kept_picture(runs: Runs, group: Group, study: Study) -> Picture:
 
 
 def draw(study: Study, label: str) -> Figure:
-    """Draw configurations side by side: state, imagined subgoals, goal, and what is decoded."""
+    """Draw configurations side by side: state, goal and imagined subgoals, two images of each."""
     assert study.decoder is not None
     pair = study.policy, study.decoder
     blocks = {task: rows(*pair, task, count, SEED) for task, count in SHOWN.items()}
     names = list(blocks["uniform"])
-    columns = sum(SHOWN.values()) + len(SHOWN) - 1
-    widths = [1.0] * columns
-    widths[SHOWN["uniform"]] = GAP
+    widths = [1.0, 1.0, GAP] * sum(SHOWN.values())
     side = (style.WIDTH - SIDE) / sum(widths)
-    height = len(names) * (side + 0.04) + 0.4
     grid = {"width_ratios": widths}
-    figure, axes = style.figure(len(names), columns, height=height, gridspec_kw=grid)
-    for row, name in enumerate(names):
-        images = [*blocks["uniform"][name], None, *blocks["hard"][name]]
-        for column, image in enumerate(images):
-            _show(axes[row * columns + column], image)
-        look: style.Look = {"ha": "right", "va": "center", "color": style.INK}
-        axes[row * columns].set_ylabel(name, rotation=0, fontsize=style.TEXT, **look)
-    for task, column in (("uniform", 0), ("hard", SHOWN["uniform"] + 1)):
-        axes[column].set_title(f"{label}, {task}", fontsize=style.TEXT, loc="left")
+    height = len(names) * (side + 0.2) + 0.4
+    figure, axes = style.figure(len(names), len(widths), height=height, gridspec_kw=grid)
+    panels = np.array(axes, object).reshape(len(names), -1, 3)
+    look: style.Look = {"ha": "right", "va": "center", "color": style.INK}
+    for name, configurations in zip(names, panels, strict=True):
+        found = [block[name] for block in blocks.values()]
+        images = zip(*(chain.from_iterable(part) for part in zip(*found, strict=True)), strict=True)
+        for place, (left, right, note) in zip(configurations, images, strict=True):
+            for panel, image in zip(place, (left, right, None), strict=True):
+                _show(panel, image)
+            place[1].set_xlabel(note, fontsize=style.SMALL)
+        configurations[0][0].set_ylabel(name, rotation=0, fontsize=style.TEXT, **look)
+    for task, first in (("uniform", 0), ("hard", SHOWN["uniform"])):
+        panels[0, first, 0].set_title(f"{label}, {task}", fontsize=style.TEXT, loc="left")
     return figure
 
 
@@ -124,18 +148,44 @@ def rows(policy: Policy, decoder: ImageDecoder, task: str, count: int, seed: int
     """Return the rows of one task: imagined subgoals where the agent has them."""
     env = policy.config.declaration().factory(num_envs=count, task=task)
     observation, _ = env.reset(seed=seed)
-    pair = observation["observation"], observation["desired_goal"]
-    seen = {"state": pair[0], "state,\ndecoded": reconstructed(policy, decoder, pair[0])}
-    goals = {"goal,\ndecoded": reconstructed(policy, decoder, pair[1]), "goal": pair[1]}
-    if policy.agent.subgoals is None:
-        return {**seen, **goals}
-    found = policy.subgoals(*pair)
-    return {
-        **seen,
-        "imagined\nsubgoal, mean": decoded(decoder, found.location.achieved_goal),
-        "imagined\nsubgoal, drawn": decoded(decoder, draws(found, count=1, seed=seed)[:, 0]),
-        **goals,
+    state, goal = observation["observation"], observation["desired_goal"]
+    ends = {
+        "state,\nand decoded": (state, reconstructed(policy, decoder, state), count * [""]),
+        "goal,\nand decoded": (goal, reconstructed(policy, decoder, goal), count * [""]),
     }
+    if policy.agent.subgoals is None:
+        return ends
+    found = policy.subgoals(state, goal)
+    drawn = np.moveaxis(draws(found, DRAWN, seed), 1, 0)
+    real = Album(policy)
+    subgoals = {"mean subgoal": np.asarray(found.location.achieved_goal)}
+    subgoals |= {f"subgoal drawn,\n{n} of {DRAWN}": each for n, each in enumerate(drawn, start=1)}
+    return ends | {
+        f"{name},\nnearest image": (decoded(decoder, each), *real.nearest(each))
+        for name, each in subgoals.items()
+    }
+
+
+class Album:
+    """Real images of an environment, to be found by the features that a policy sees in them.
+
+    Args:
+        policy: The policy.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self._images = real_images(policy)
+        seen = features(policy, self._images)
+        self._scale = np.maximum(seen.std(axis=0), 1e-6)
+        self._tree = cKDTree(seen / self._scale)
+        goals = len(seen) // 4  # the last quarter, whose images are independent of the others
+        others = cKDTree(seen[:-goals] / self._scale)
+        self._usual = float(np.median(others.query(seen[-goals:] / self._scale)[0]))
+
+    def nearest(self, found: Float[np.ndarray, "B F"]) -> tuple[Images, list[str]]:
+        """Return the images whose features are nearest, and how far these are, in words."""
+        distance, number = self._tree.query(found / self._scale)
+        return self._images[number], [f"{d:.1f}" for d in distance / self._usual]
 
 
 def _show(axes: Axes, image: NumPyArray | None) -> None:

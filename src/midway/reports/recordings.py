@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from midway.agent import AgentState, AnyAgent, Memory, SubgoalDistribution
 from midway.runs.policy import Policy
-from midway.training.evaluate import rollout
+from midway.training.evaluate import ActionKind, rollout
 from midway.training.progress import stages_of
 from midway.types import NumPyArray, VectorGoalEnv
 
@@ -65,15 +65,20 @@ class Recording:
 
 
 def record(
-    policy: Policy, episodes: Mapping[str, int], seed: int, draw: bool = False
+    policy: Policy,
+    episodes: Mapping[str, int],
+    seed: int,
+    draw: bool = False,
+    actions: ActionKind = "mean",
 ) -> list[Recording]:
-    """Run episodes of the deterministic policy, all at once.
+    """Run episodes of a policy, all at once.
 
     Args:
         policy: The policy, in the environment that it was trained for.
         episodes: Number of episodes of each task.
         seed: The same seed gives the same starts and goals.
         draw: Whether the environment is to draw itself; one that is not midway's and can.
+        actions: ``mean`` or ``sampled``.
     """
     tasks = np.repeat(list(episodes), list(episodes.values()))
     factory = partial(policy.config.declaration().factory, num_envs=len(tasks))
@@ -81,7 +86,7 @@ def record(
     observation = _reset(env, tasks, seed)
     goals, targets = observation["desired_goal"].copy(), env.success_pair(observation)[1].copy()
     seen = [(observation["observation"].copy(), env.success_pair(observation)[0].copy())]
-    actor, plans, reached = policy.actor(), [], np.zeros(len(tasks), np.bool_)
+    actor, plans, reached = policy.actor(actions, seed), [], np.zeros(len(tasks), np.bool_)
     lengths, drawn = np.zeros(len(tasks), np.int64), [pictures(env)]
     told = stages_of("steps of recorded episodes", policy.spec.max_episode_steps)
     for moment in rollout(env, actor, observation):

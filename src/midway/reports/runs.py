@@ -2,9 +2,9 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
@@ -16,6 +16,7 @@ from midway.envs.views import View
 from midway.errors import ConfigurationError
 from midway.reports import style
 from midway.runs import kept
+from midway.runs import policy as policies
 from midway.runs.folder import RunConfig, RunFolder, read_json, run_name
 from midway.runs.kept import Best, Which
 from midway.tables import Table
@@ -48,6 +49,7 @@ class RunData:
         evaluation: Evaluations; no columns before the first row.
         damaged: What cannot be read, in words; it is treated as if it were not there.
         which: The policy that is looked at.
+        changes: Settings that it acts with, in place of those it was trained with.
     """
 
     folder: RunFolder
@@ -57,6 +59,7 @@ class RunData:
     evaluation: Table
     damaged: tuple[str, ...] = ()
     which: Which = "last"
+    changes: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def steps(self) -> int:
@@ -122,6 +125,12 @@ class RunData:
         return agents.get(self.config.agent)
 
     @property
+    def acting(self) -> JsonObject:
+        """What a trained policy may be given other values of, as it acts here."""
+        trained = self.config.hyperparameters
+        return {n: getattr(trained, n) for n in self.agent.test_settings} | dict(self.changes)
+
+    @property
     def view(self) -> View | None:
         """How the environment is drawn; None if nobody knows."""
         with suppress(ConfigurationError):  # its package may be missing here
@@ -183,25 +192,30 @@ class Runs:
         return self.groups[0].runs[0].view
 
 
-def read(path: Path, policy: Which = "last") -> RunData:
+def read(
+    path: Path, policy: Which = "last", changes: Mapping[str, object] | None = None
+) -> RunData:
     """Return what is in a run folder.
 
     Args:
         path: The run folder.
         policy: The policy that is looked at.
+        changes: Settings that it acts with, as in `Policy.using`.
 
     Raises:
-        ConfigurationError: It is no run folder, or its configuration is damaged or of another
-            version.
+        ConfigurationError: It is no run folder, its configuration is damaged or of another version,
+            or a setting may not change after training.
     """
     folder = RunFolder.at(path)
     config = folder.load_config()
+    changed = policies.acting_settings(config, changes or {}).hyperparameters
+    changes = {name: getattr(changed, name) for name in changes or {}}
     record = read_json(folder.config_file)
     metrics, wrong = _table(folder.metrics_file, METRICS)
     evaluation, wrong_too = _table(folder.evaluation_file, EVALUATION)
     weights = [_damage(file) for file in kept.snapshots(folder).values()]
     damaged = tuple(text for text in (wrong, wrong_too, *weights) if text)
-    return RunData(folder, config, record, metrics, evaluation, damaged, policy)
+    return RunData(folder, config, record, metrics, evaluation, damaged, policy, changes)
 
 
 def _table(path: Path, columns: Sequence[str]) -> tuple[Table, str]:

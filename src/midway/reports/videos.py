@@ -1,7 +1,7 @@
 """Videos of a policy with the subgoals that it imagines on its way, as files or in a window."""
 
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
 from itertools import chain
 from pathlib import Path
@@ -39,6 +39,7 @@ def watch(
     episodes: int = 1,
     seed: int = 0,
     policy: Which = "last",
+    changes: Mapping[str, object] | None = None,
 ) -> Path:
     """Write a video of a trained policy, which acts deterministically.
 
@@ -50,14 +51,15 @@ def watch(
         episodes: Number of episodes, one after the other.
         seed: Seed of starts and goals.
         policy: ``last``, ``best``, or a step whose policy was kept.
+        changes: Settings that the policy acts with, as in `midway.api.load`.
 
     Returns:
         The file.
 
     Raises:
-        ConfigurationError: The folder, policy, task, number or file cannot be used.
+        ConfigurationError: The folder, policy, task, setting, number or file cannot be used.
     """
-    run = read(Path(path), policy)
+    run = read(Path(path), policy, changes)
     task = task or run.config.declaration().shown_task
     out = Path(out or run.folder.path / "videos" / f"{task}.mp4")
     if out.suffix not in RATES:
@@ -73,6 +75,7 @@ def show(
     episodes: int = 1,
     seed: int = 0,
     policy: Which = "last",
+    changes: Mapping[str, object] | None = None,
 ) -> None:
     """Show the same in a window, until the last episode has ended or the window is closed.
 
@@ -82,11 +85,12 @@ def show(
         episodes: As in ``watch``.
         seed: As in ``watch``.
         policy: As in ``watch``.
+        changes: As in ``watch``.
 
     Raises:
         ConfigurationError: As in ``watch``, or there is no display here.
     """
-    run = read(Path(path), policy)
+    run = read(Path(path), policy, changes)
     task = task or run.config.declaration().shown_task
     check_display()
     frames, rate = film(run, task, episodes, seed, RATES[".mp4"])
@@ -103,7 +107,7 @@ def film(
     """
     if episodes < 1:
         raise ConfigurationError(f"episodes {episodes}: must be at least 1")
-    policy = policies.load(run.folder, run.weights)
+    policy = policies.load(run.folder, run.weights).using(run.changes)
     (label,) = agent_labels([run.config.agent])
     title = f"{label} on {run.config.env}, {task}"
     make = scenes.maker(run.folder, policy, title)

@@ -26,6 +26,7 @@ from midway.runs.folder import (
     read_json,
     write_json,
 )
+from midway.settings import changed
 from midway.training import acting, freeze
 from midway.training.acting import Seen
 from midway.training.arrays import array_names, load_arrays, networks_of, said_of, save_arrays
@@ -56,6 +57,22 @@ class Policy:
     spec: EnvSpec
     step: int | None = None
     encoder: Encoder | None = None
+
+    def using(self, changes: Mapping[str, object]) -> "Policy":
+        """Return the policy with other values of settings that training did not depend on.
+
+        Args:
+            changes: Values by name, such as ``{"num_subgoals": 3}`` of LEAP; text is read as a
+                Python literal.
+
+        Raises:
+            ConfigurationError: The agent has no such setting, or the value is not allowed.
+        """
+        if not changes:
+            return self
+        config = acting_settings(self.config, changes)
+        state = dataclasses.replace(self.state, config=config.hyperparameters)
+        return dataclasses.replace(self, state=state, config=config)
 
     def __call__(self, observation: AnyArray, goal: AnyArray) -> NumPyArray:
         """Return the deterministic action, ``(action_dim,)`` or ``(B, action_dim)``.
@@ -184,6 +201,23 @@ def _act_on(
 ) -> tuple[Float[Array, "B A"], Memory]:
     pair = (_read(encoder, observation), _read(encoder, goal))
     return acting.act(agent, state, memory, *pair, key, explore=explore)
+
+
+def acting_settings(config: RunConfig, changes: Mapping[str, object]) -> RunConfig:
+    """Return the configuration with other values of settings that a trained policy may be given.
+
+    Raises:
+        ConfigurationError: The agent has no such setting, or the value is not allowed.
+    """
+    allowed = registry.get(config.agent).test_settings
+    for name in changes:
+        if name not in allowed:
+            others = f"use one of {', '.join(allowed)}" if allowed else "it has none that may"
+            raise ConfigurationError(
+                f"setting {name!r} of {config.agent} may not change after training: {others}"
+            )
+    hyperparameters = changed(config.hyperparameters, changes)
+    return dataclasses.replace(config, hyperparameters=hyperparameters)
 
 
 def current(config: RunConfig, training: Training) -> Policy:

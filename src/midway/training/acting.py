@@ -23,9 +23,24 @@ fold_in = jax.jit(jax.random.fold_in)
 """``(key, number) -> key``, as `jax.random.fold_in` in a tenth of the time: every step asks."""
 
 
-def begin(agent: AnyAgent, config: Hyperparameters, spec: EnvSpec, num_episodes: int) -> Memory:
+Ways = Float[AnyArray, " B"]
+"""How far goals are from where episodes begin, as shares of the environment's longest way."""
+
+
+def begin(
+    agent: AnyAgent,
+    config: Hyperparameters,
+    spec: EnvSpec,
+    num_episodes: int,
+    ways: Ways | None = None,
+) -> Memory:
     """Return what the agent remembers before the first step of each episode."""
-    return agent.memory.begin(config, spec, num_episodes) if agent.memory else ()
+    if agent.memory is None:
+        return ()
+    memory = agent.memory.begin(config, spec, num_episodes)
+    if ways is None or agent.memory.adapt is None:
+        return memory
+    return agent.memory.adapt(config, memory, ways)
 
 
 def act(
@@ -61,13 +76,23 @@ class Actor:
     Args:
         agent: The agent, for what it does with episodes that are over.
         act: The policy on a memory.
-        begin: Returns the memory of as many new episodes.
+        begin: Returns the memory of as many new episodes, with ways to their goals if known.
         key: Key of all draws.
+
+    Attributes:
+        adapts: Whether it acts differently where it knows the ways to the goals.
+        ways: These ways, if they are known before the first call.
     """
 
     def __init__(
-        self, agent: AnyAgent, act: Act, begin: Callable[[int], Memory], key: Key[Array, ""]
+        self,
+        agent: AnyAgent,
+        act: Act,
+        begin: Callable[[int, Ways | None], Memory],
+        key: Key[Array, ""],
     ) -> None:
+        self.adapts = agent.memory is not None and agent.memory.adapt is not None
+        self.ways: Ways | None = None
         self._rest = agent.memory.rest if agent.memory else None
         self._act = act
         self._begin = begin
@@ -78,7 +103,7 @@ class Actor:
     def __call__(self, observation: Seen, goal: Seen) -> NumPyArray:
         """Return actions ``(B, action_dim)`` for one step of every environment."""
         if self._calls == 0:
-            self.memory = self._begin(len(observation))
+            self.memory = self._begin(len(observation), self.ways)
         key = fold_in(self._key, self._calls)
         self._calls += 1
         actions, self.memory = self._act(self.memory, observation, goal, key)

@@ -8,6 +8,7 @@ import numpy as np
 
 from midway.statistics import Estimate, of_policy
 from midway.training import faults
+from midway.training.acting import Actor
 from midway.types import AnyArray, Info, NumPyArray, Observations, VectorGoalEnv
 
 ActionKind: TypeAlias = Literal["mean", "sampled"]
@@ -99,7 +100,8 @@ def rollout(env: VectorGoalEnv, actor: Policy, observation: Observations) -> Ite
 
     Args:
         env: A vector environment without autoreset, just reset.
-        actor: The policy; it is told of episodes that are over if it has a method ``rest``.
+        actor: The policy; it is told of episodes that are over if it has a method ``rest``, and of
+            the ways to the goals if it ``adapts``.
         observation: The observations of the reset.
 
     Raises:
@@ -107,6 +109,8 @@ def rollout(env: VectorGoalEnv, actor: Policy, observation: Observations) -> Ite
     """
     running = np.ones(env.num_envs, np.bool_)
     rest = getattr(actor, "rest", lambda done: None)
+    if isinstance(actor, Actor) and actor.adapts:
+        actor.ways = env.ways()
     while running.any():
         action = np.asarray(actor(observation["observation"], observation["desired_goal"]))
         observation, _, terminated, truncated, info = env.step(action)

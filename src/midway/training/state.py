@@ -117,10 +117,10 @@ class Training:
         """What agents may know of the environment itself, images included."""
         return freeze.thawed(self.collector.env).goal_spec
 
-    def begin_episodes(self, count: int) -> Memory:
+    def begin_episodes(self, count: int, ways: acting.Ways | None = None) -> Memory:
         """Return what the agent remembers at the start of as many episodes."""
         agent, config = self.setup.agent, self.setup.hyperparameters
-        fresh = acting.begin(agent, config, self.program.spec, count)
+        fresh = acting.begin(agent, config, self.program.spec, count, ways)
         return _devices(self.setup).copied(fresh)
 
     def make_env(self, count: int, task: str) -> VectorGoalEnv:
