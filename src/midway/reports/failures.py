@@ -54,7 +54,8 @@ def _maps(runs: Runs, group: Group, study: Study, failed: Sequence[Episode]) -> 
         f"{runs.slug}-{group.slug}-failures",
         lambda: draw(study.maze, shown),
         f"Failures of {group.label}",
-        f"{len(shown)} of the {_counted(study, failed, len(study.episodes()))}; the cross is where an episode ended.",
+        f"{len(shown)} of the {_counted(study, failed, len(study.episodes()))}; the cross is where "
+        "an episode ended.",
         f"Maps of {runs.env} with the ways of failed episodes of {group.label}.",
         conclusion(study.maze, failed),
     )
