@@ -54,7 +54,8 @@ def _maps(runs: Runs, group: Group, study: Study, failed: Sequence[Episode]) -> 
         f"{runs.slug}-{group.slug}-failures",
         lambda: draw(study.maze, shown),
         f"Failures of {group.label}",
-        f"{len(shown)} of the {_counted(study, failed)}; the cross is where an episode ended.",
+        f"{len(shown)} of the {_counted(study, failed, len(study.episodes()))}; the cross is where "
+        "an episode ended.",
         f"Maps of {runs.env} with the ways of failed episodes of {group.label}.",
         conclusion(study.maze, failed),
     )
@@ -67,19 +68,19 @@ def _curves(runs: Runs, group: Group, study: Study, failed: Sequence[Recording])
         f"{runs.slug}-{group.slug}-failures",
         lambda: draw_distances(task, study.recordings, unit),
         f"Failures of {group.label}",
-        f"Distance to the goal along the {_counted(study, failed)}, and, pale, along those that "
-        "did; the cross is where an episode ended.",
+        f"Distance to the goal along the {_counted(study, failed, len(study.recordings))}, and, "
+        "pale, along those that did; the cross is where an episode ended.",
         f"Distance to the goal in {runs.env} over the steps of failed episodes of {group.label}.",
         conclusion_of_distances(task, failed, limit),
     )
 
 
-def _counted(study: Study, failed: Sequence[Episode | Recording]) -> str:
+def _counted(study: Study, failed: Sequence[Episode | Recording], total: int) -> str:
     """Return how many episodes failed of those that were recorded, and of which tasks."""
     tasks = {task: sum(e.task == task for e in failed) for task in {e.task: 0 for e in failed}}
     listed = ", ".join(f"{count} of {task}" for task, count in tasks.items())
     return (
-        f"{len(failed)} recorded episodes of {len(study.recordings)} that did not reach their goal "
+        f"{len(failed)} recorded episodes of {total} that did not reach their goal "
         f"({study.where}; {listed})"
     )
 
