@@ -68,7 +68,7 @@ test-lowest:
 wheel: $(VENV)/installed
 	$(BIN)/python -m build --outdir dist .
 
-# Builds both, and uses the wheel outside the checkout as a newcomer would; LEAP's autoencoders in all environments.
+# Builds both, and uses the wheel outside the checkout as a newcomer would; bounds the error of LEAP's autoencoders.
 release-check: $(VENV)/installed
 	$(BIN)/pytest -m release tests/test_release.py tests/training/test_pretrain.py
 
