@@ -322,13 +322,6 @@ QUICK: tuple[Rule, ...] = (
         env="point-*",
         agent="ris",
     ),
-    Rule(
-        "quick",
-        {"relabel": RelabelMix(own=0.0, random=0.0, future=1.0, future_discount=0.97)},
-        "trials of point-u: one step towards a far goal is worth three times as much",
-        env="point-*",
-        agent="crl",
-    ),
     Rule("quick", {"relabel": HINDSIGHT_OF_LEAP}, "code of LEAP", agent="tdm leap"),
     Rule("quick", {"evaluate_every": 16_000}, "leap.md: evaluations plan", agent="leap"),
     Rule("quick", {"evaluate_every": 75_000}, "leap.md", env="ant-*", agent="leap"),

@@ -67,4 +67,4 @@ def test_the_page_opens_in_a_browser(ris_run, tmp_path, width):
 def test_the_page_of_images_opens_in_a_browser(image_run, tmp_path, quick_decoder):
     page, *_ = report([image_run], tmp_path / "out")
     title = title_after_loading(page, tmp_path / "profile", 1280)
-    assert title == "images 4 loaded 4 fetched 0 wide 0"
+    assert title == "images 5 loaded 5 fetched 0 wide 0"

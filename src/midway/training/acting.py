@@ -19,9 +19,6 @@ Seen = Shaped[AnyArray, "B ..."]
 Act = Callable[[Memory, Seen, Seen, Key[Array, ""]], tuple[Float[Array, "B action_dim"], Memory]]
 """``(memory, observation, goal, key) -> (actions, memory)``."""
 
-fold_in = jax.jit(jax.random.fold_in)
-"""``(key, number) -> key``, as `jax.random.fold_in` in a tenth of the time: every step asks."""
-
 
 Ways = Float[AnyArray, " B"]
 """How far goals are from where episodes begin, as shares of the environment's longest way."""
@@ -104,7 +101,7 @@ class Actor:
         """Return actions ``(B, action_dim)`` for one step of every environment."""
         if self._calls == 0:
             self.memory = self._begin(len(observation), self.ways)
-        key = fold_in(self._key, self._calls)
+        key = jax.random.fold_in(self._key, self._calls)
         self._calls += 1
         actions, self.memory = self._act(self.memory, observation, goal, key)
         return np.asarray(actions)

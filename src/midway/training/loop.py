@@ -97,7 +97,7 @@ def _choose(training: Training, observation: Observations) -> NumPyArray:
         generator = np.random.default_rng((streams.action, steps))
         shape = (train.num_envs, training.program.spec.action_dim)
         return generator.uniform(-1, 1, shape).astype(np.float32)
-    key = acting.fold_in(streams.act_key, steps)
+    key = jax.random.fold_in(streams.act_key, steps)
     pair = observation["observation"], observation["desired_goal"]
     actions, training.memory = training.program.act(training.arrays, training.memory, *pair, key)
     if not np.isfinite(actions).all():
