@@ -39,12 +39,12 @@ def test_mazes(ris_run, sac_run, leap_run, copy_run, tmp_path):
 
 
 def test_a_table(state_run, tmp_path):
-    assert check([state_run], tmp_path) == 3
+    assert check([state_run], tmp_path) == 4
 
 
 @needs_renderer
 def test_images(image_run, tmp_path, quick_decoder):
-    assert check([image_run], tmp_path) == 4
+    assert check([image_run], tmp_path) == 5
 
 
 @pytest.mark.parametrize("name", ["u", "omega"])

@@ -127,7 +127,7 @@ def test_the_command_line_evaluates_the_best(
     whole: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
-    monkeypatch.setattr(api, "load", lambda path, which: asked.append(which) or Path())
+    monkeypatch.setattr(api, "load", lambda path, which, _: asked.append(which) or Path())
     for words in (["best"], ["last"], ["6e1"]):
         with pytest.raises(AttributeError):
             main(["evaluate", str(whole), "--policy", *words])
