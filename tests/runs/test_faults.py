@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import midway
+import short
 from midway.api import Run
 from midway.cli.main import main
 from midway.errors import BrokenEnvironmentError, NonFiniteObservationError
@@ -304,7 +305,7 @@ def _interrupting(seed: int) -> np.random.Generator:
 def test_a_closed_pipe_of_standard_error_does_not_end_a_run(whole: Path, tmp_path: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    words = [sys.executable, "-m", "midway.cli", *command(tmp_path / "run")]
+    words = [sys.executable, short.__file__, *command(tmp_path / "run")]
     ended = subprocess.run(words, stderr=writing, stdout=subprocess.PIPE, check=False)
     os.close(writing)
     assert ended.returncode == 0
