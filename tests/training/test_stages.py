@@ -1,8 +1,10 @@
 """Long actions say how far they are, and the first signal ends what keeps nothing."""
 
+import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -18,6 +20,15 @@ with {context}:
     hashlib.pbkdf2_hmac("sha256", b"native", b"code", 10**9)
 """
 """Signals itself once native code runs, which lets Python's other threads run."""
+
+COMPILING = """
+import sys
+from midway.cli.main import main
+from midway.training import signals
+signals.GRACE = 0.2
+main(["train", "point-u", "--out", sys.argv[1], "--set", "steps=4000", "evaluation_episodes=1"])
+"""
+"""A run that has to compile its update, which takes XLA seconds."""
 
 COMMAND = "signals.ending_soon(grace=0.2)"
 RUN = "signals.ending_in_time(), signals.listening()"
@@ -47,3 +58,25 @@ def test_signals_end_native_code_too(context: str, numbers: list[signal.Signals]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode in [128 + number for number in numbers]
     assert done.stderr == "midway: interrupted\n"
+
+
+def test_a_signal_ends_a_run_while_its_update_is_compiled(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    says = {"JAX_LOG_COMPILES": "1", "XDG_CACHE_HOME": str(tmp_path)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMPILING, str(run)],
+        env=os.environ | says,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    with process:
+        for line in process.stderr:
+            if "Compiling jit(train)" in line:
+                process.send_signal(signal.SIGTERM)
+                break
+        rest = process.stderr.read()
+    assert process.returncode == 128 + signal.SIGTERM
+    assert "Finished XLA compilation of jit(train)" not in rest
+    assert rest.splitlines()[-1].startswith("midway: interrupted in the middle of a step; ")
+    assert (run / "config.json").exists()
