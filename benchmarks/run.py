@@ -26,17 +26,17 @@ SEEDS = range(5)
 F32 = ("--precision", "f32")
 BF16 = ("--precision", "bf16")
 ROBOTICS = {
-    "PandaReach-v3": 12_000,
+    "PandaReach-v3": 20_000,
     "PointMaze_UMaze-v3": 32_000,
-    "PointMaze_Medium-v3": 40_000,
+    "PointMaze_Medium-v3": 64_000,
     "FetchReach-v4": 12_000,
+    "FetchPush-v4": 200_000,
+    "PandaPush-v3": 100_000,
 }
 """Environment steps on the environments of others; 50 episodes an evaluation take their time."""
 WITHOUT = {
     "n-step": ("n_step=1",),
     "goal-inputs": ("goal_inputs=whole", "normalise=False"),
-    "candidates": ("candidates_per_pair=1",),
-    "hindsight-bound": ("hindsight_bound=False",),
     "unreached-goals": ("unreached_goals=False",),
     "single-critic": ("num_critics=2",),
     "collect-limit": ("collect_limit=0",),

@@ -147,6 +147,7 @@ def resume(
     folder.load_config()  # a folder that is no run's is refused without a lock in it
     with folder.lock():
         config = folder.load_config()
+        folder.check_goes_on()
         new: dict[str, object] = {"steps": steps, "devices": devices}
         new |= {"stop_at": stop_at, "on_env_error": on_env_error}
         given = {name: value for name, value in new.items() if value is not None}

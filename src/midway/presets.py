@@ -225,7 +225,6 @@ QUICK: tuple[Rule, ...] = (
         {
             "n_step": 5,
             "clip_targets": True,
-            "hindsight_bound": True,
             "unreached_goals": True,
             "num_critics": 1,
             "layer_norm": True,
@@ -243,7 +242,6 @@ QUICK: tuple[Rule, ...] = (
             "steps": 50_000,
             "n_step": 3,
             "clip_targets": True,
-            "hindsight_bound": True,
             "unreached_goals": True,
             "layer_norm": True,
             "normalise": True,
@@ -255,7 +253,7 @@ QUICK: tuple[Rule, ...] = (
     ),
     Rule(
         "quick",
-        {"candidates_per_pair": 8, "advantage_temperature": 2.0, "subgoal_learning_rate": 1e-3},
+        {"advantage_temperature": 2.0, "subgoal_learning_rate": 1e-3},
         "as on ant-u, seen on PandaReach and PointMaze",
         family="other",
         agent="ris",
@@ -265,7 +263,6 @@ QUICK: tuple[Rule, ...] = (
         {
             "num_subgoals": 4,
             "subgoal_every": 4,
-            "candidates_per_pair": 8,
             "advantage_temperature": 2.0,
         },
         "trials of ant-u: beyond the paper",

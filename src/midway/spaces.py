@@ -54,7 +54,6 @@ SPACE: Space = {
     "advantage_temperature": Range(0.05, 3.0, log=True),
     "n_step": Choice((1, 3, 5)),
     "clip_targets": Choice((False, True)),
-    "hindsight_bound": Choice((False, True)),
     "layer_norm": Choice((False, True)),
 }
 """What is tuned by default, of the settings that an agent has.

@@ -315,10 +315,8 @@ class Batch(NamedTuple):
     """Relabelled transitions; reward and terminated belong to ``goal``.
 
     ``outcome`` is what they were computed from; ``None`` where that is ``next_observation`` and
-    ``goal``. The others are there where `Sampling` asks for them: ``steps`` from the observation to
-    the next one, steps that the episode needed from the observation to the goal (infinite where
-    it is not known to get there), and an observation between the two. ``failed``: whether the
-    environment ended the episode there without success; only where it may.
+    ``goal``. ``steps``: from the observation to the next one, where `Sampling` asks for several.
+    ``failed``: whether the environment ended the episode there without success; where it may.
     """
 
     observation: Shaped[Array, "B ..."]
@@ -330,8 +328,6 @@ class Batch(NamedTuple):
     subgoal_candidate: Subgoal
     outcome: Outcome | None = None
     steps: Float[Array, " B"] | None = None
-    reached_in: Float[Array, " B"] | None = None
-    between: Shaped[Array, "B ..."] | None = None
     failed: Bool[Array, " B"] | None = None
 
 
@@ -343,14 +339,10 @@ class Sampling:
         n_step: Steps from an observation to its next observation, at most; the way ends earlier
             where the goal is reached or the episode ends.
         unreached: Whether goals that are reached in the observation itself are drawn again.
-        reached_in: Whether `Batch.reached_in` is wanted.
-        between: Whether `Batch.between` is wanted.
     """
 
     n_step: int = 1
     unreached: bool = False
-    reached_in: bool = False
-    between: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Beyond the paper: targets, candidates, inputs and delayed steps, against NumPy by hand."""
+"""Beyond the paper: targets, inputs and delayed steps, against NumPy by hand."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from midway.agents import beyond, ris, sac
-from midway.networks import encoder, inputs, optimizer
+from midway.networks import encoder, inputs
 from midway.networks.encoder import StateEncoder
 from midway.networks.mlp import normalised
 from midway.types import Batch, DistanceTask, EnvSpec, Subgoal
@@ -22,7 +22,6 @@ KEY = jax.random.key(0)
 FAST = {
     "n_step": 3,
     "clip_targets": True,
-    "hindsight_bound": True,
     "unreached_goals": True,
     "num_critics": 1,
     "layer_norm": True,
@@ -46,8 +45,6 @@ def batch(size: int = 8, **others: object) -> Batch:
         goal=normal(size, 4),
         subgoal_candidate=Subgoal(normal(size, 4), normal(size, 4)),
         steps=jnp.full(size, 3.0),
-        reached_in=jnp.full(size, 10.0**6),
-        between=normal(size, 4),
     )
     return drawn._replace(**others)
 
@@ -60,18 +57,10 @@ def test_targets_of_n_steps_by_hand():
 
 
 def test_targets_of_one_step_are_those_of_the_paper():
-    drawn = batch(4, steps=None, reached_in=None)
+    drawn = batch(4, steps=None)
     value = jnp.array([-1.0, -2.0, -3.0, -4.0])
     found = beyond.n_step_target(drawn, value, sac.Config())
     np.testing.assert_array_equal(found, -1 + 0.99 * np.array([0, -2, -3, -4], np.float32))
-
-
-def test_the_way_of_the_episode_bounds_targets_from_below():
-    config = sac.Config(discount=0.5, hindsight_bound=True)
-    drawn = batch(4, steps=jnp.ones(4), terminated=jnp.zeros(4, bool))
-    drawn = drawn._replace(reached_in=jnp.array([2.0, 10.0**6, 1.0, 3.0]))
-    target = beyond.n_step_target(drawn, jnp.full(4, -9.0), config)
-    np.testing.assert_allclose(target, [-1.5, -2, -1, -1.75])
 
 
 def test_targets_are_clipped():
@@ -150,49 +139,9 @@ def test_normalised_layers_have_mean_0_and_variance_1():
     np.testing.assert_allclose(x.var(-1), 1, rtol=1e-3)
 
 
-def test_candidates_begin_with_the_state_in_between():
-    drawn = batch(8)
-    few, candidates = beyond.candidates_of_each_pair(drawn, 3, 4)
-    assert candidates.shape == (4, 3, 4)
-    np.testing.assert_array_equal(few.goal, drawn.goal[::2])
-    np.testing.assert_array_equal(candidates[:, 0], drawn.between[::2])
-    own = np.arange(0, 8, 2)
-    assert not (candidates[:, 1] == drawn.subgoal_candidate.observation[own]).all(-1).any()
-
-
-def test_cheap_candidates_weigh_more():
-    weight = beyond.candidate_weights(jnp.array([[1.0, 3.0], [2.0, 2.0]]), 2.0)
-    first = 1 / (1 + np.exp(-1))
-    np.testing.assert_allclose(weight, [[first, 1 - first], [0.5, 0.5]], rtol=1e-5)
-
-
-def test_the_subgoal_policy_comes_to_the_cheapest_candidate():
-    config = ris.Config(
-        hidden=(16,), subgoal_learning_rate=0.02, candidates_per_pair=4, candidate_pairs=4
-    )
-    state = ris.create(config, SPEC, KEY)
-    drawn = batch(16)
-    best = drawn.between
-
-    def cost_of(rows: Batch, subgoal: Subgoal) -> jax.Array:
-        near = jnp.abs(subgoal.observation[:, None] - best[None]).sum(-1).min(1)
-        return 100 * near
-
-    def loss(policy: object) -> jax.Array:
-        return beyond.candidate_loss(policy, cost_of, drawn, SPEC, config)[0]
-
-    policy, adam = state.subgoal_policy, state.subgoal_optimizer
-    first = loss(policy)
-    for _ in range(100):
-        policy, adam, _ = optimizer.minimise(
-            lambda p: beyond.candidate_loss(p, cost_of, drawn, SPEC, config), policy, adam, 0.02
-        )
-    assert loss(policy) < first - 1
-
-
 @pytest.mark.parametrize("module", [ris, sac])
 def test_delayed_policies_step_in_every_second_update(module):
-    extra = {"candidates_per_pair": 4, "subgoal_every": 2} if module is ris else {}
+    extra = {"subgoal_every": 2} if module is ris else {}
     config = module.Config(hidden=(8,), **FAST, **extra)
     state = module.create(config, SPEC, KEY)
     compiled = eqx.filter_jit(module.update)

@@ -109,5 +109,23 @@ def test_configurations_of_format_1_are_understood(path: Path) -> None:
     assert all(found["train"][name] == value for name, value in train.items())
 
 
+def test_runs_with_a_setting_that_is_gone_are_read_but_not_continued(tmp_path: Path) -> None:
+    run = midway.train("point-u", agent="sac", out=tmp_path / "run", changes=TINY)
+    file = run.path / "config.json"
+    values, config = json.loads(file.read_text()), RunFolder(run.path).load_config()
+
+    def begun_with(on: bool) -> None:
+        agent = {**values["hyperparameters"], "hindsight_bound": on}
+        file.write_text(json.dumps(files.sealed({**values, "format": 3, "hyperparameters": agent})))
+        assert RunFolder(run.path).load_config() == config
+
+    begun_with(True)
+    assert midway.load(run.path).step == TINY["steps"]
+    with pytest.raises(ConfigurationError, match="learned with hindsight_bound=True"):
+        midway.resume(run.path, steps=120)
+    begun_with(False)
+    assert midway.resume(run.path, steps=120).finished
+
+
 def test_there_are_configurations_of_format_1() -> None:
     assert len(COMMITTED) > 6

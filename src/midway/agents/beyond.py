@@ -4,7 +4,7 @@ Formulas, reasons and measured effects: docs/algorithms/ris.md, section "Beyond 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
@@ -18,9 +18,9 @@ from midway.networks import inputs
 from midway.networks.critics import TwinCritic
 from midway.networks.encoder import Encoder, EncoderConfig
 from midway.networks.inputs import GOAL_INPUTS, GoalInputs, PairInputs
-from midway.networks.policies import GaussianPolicy, SubgoalPolicy
+from midway.networks.policies import GaussianPolicy
 from midway.settings import setting
-from midway.types import Batch, EnvSpec, Metrics, Sampling, Subgoal
+from midway.types import Batch, EnvSpec, Metrics, Sampling
 
 State = TypeVar("State", bound=eqx.Module)
 
@@ -31,7 +31,6 @@ class Settings:
 
     n_step: int = setting(1, "none", "steps of the return before the critics", least=1, most=50)
     clip_targets: bool = setting(False, "none", "targets within [-1 / (1 - γ), 0]")
-    hindsight_bound: bool = setting(False, "none", "values not below the episode's own way")
     unreached_goals: bool = setting(False, "none", "no goals that are reached already")
     num_critics: int = setting(2, "appendix B", "Q networks", choices=(1, 2))
     layer_norm: bool = setting(False, "none", "in the critics")
@@ -49,8 +48,6 @@ class SubgoalSettings(Settings):
     subgoal_every: int = setting(
         1, "code of RIS", "updates for each of the subgoal policy", least=1
     )
-    candidates_per_pair: int = setting(1, "one, all in one softmax", "subgoals weighed", least=1)
-    candidate_pairs: int = setting(32, "none", "rows with candidates of their own", least=1)
 
 
 @runtime_checkable
@@ -95,33 +92,12 @@ class Discounted(Protocol):
         """Whether targets are kept in [-1 / (1 - γ), 0]."""
 
     @property
-    def hindsight_bound(self) -> bool:
-        """Whether the way that the episode took to the goal bounds its value from below."""
-
-    @property
     def failure_cost(self) -> float:
         """Cost of an episode that fails, times 1 / (1 - γ)."""
 
     @property
     def unreached_goals(self) -> bool:
         """Whether goals that are reached already are drawn again."""
-
-
-@runtime_checkable
-class Weighed(Discounted, Protocol):
-    """Settings with candidates of each pair, and a temperature λ."""
-
-    @property
-    def advantage_temperature(self) -> float:
-        """λ."""
-
-    @property
-    def candidates_per_pair(self) -> int:
-        """Candidates of each pair."""
-
-    @property
-    def candidate_pairs(self) -> int:
-        """Rows of the batch that have them."""
 
 
 def actor_critic(
@@ -154,12 +130,7 @@ def pair_size(spec: EnvSpec, read: PairInputs) -> int:
 
 def sampling(config: Discounted) -> Sampling:
     """Return what an agent of these settings wants to be drawn."""
-    return Sampling(config.n_step, config.unreached_goals, config.hindsight_bound)
-
-
-def subgoal_sampling(config: "Weighed") -> Sampling:
-    """Return what RIS wants to be drawn: states in between for candidates of each pair too."""
-    return replace(sampling(config), between=config.candidates_per_pair > 1)
+    return Sampling(config.n_step, config.unreached_goals)
 
 
 def n_step_target(
@@ -167,17 +138,15 @@ def n_step_target(
 ) -> Float[Array, " B"]:
     """Return the target of Q after n steps: -(1 - γ^n) / (1 - γ) + γ^n (1 - terminated) V(s_n, g).
 
-    For n = 1 this is `functional.td_target` with reward -1. Then the two bounds, where asked for:
-    never below what the episode itself needed to the goal, never outside [-1 / (1 - γ), 0]. A step
-    that fails is worth ``failure_cost`` times -1 / (1 - γ): as much as never to get there.
+    For n = 1 this is `functional.td_target` with reward -1. Clipped, it is never outside
+    [-1 / (1 - γ), 0]. A step that fails is worth ``failure_cost`` times -1 / (1 - γ): as much as
+    never to get there.
     """
     discount = config.discount
     kept = discount if batch.steps is None else discount**batch.steps
     reward = batch.reward if batch.steps is None else discounted(batch.steps, discount)
     terminated = batch.terminated.astype(jnp.float32)
     target = functional.td_target(reward, terminated, next_value, kept)
-    if config.hindsight_bound and batch.reached_in is not None:
-        target = jnp.maximum(target, discounted(batch.reached_in, discount))
     if batch.failed is not None:
         lost = -config.failure_cost * functional.value_bound(discount)
         before = jnp.zeros_like(target) if batch.steps is None else batch.steps - 1
@@ -191,68 +160,6 @@ def n_step_target(
 def discounted(steps: Float[Array, " B"], discount: float) -> Float[Array, " B"]:
     """Return the value of a goal that is so many steps away, -(1 - γ^n) / (1 - γ)."""
     return -(1 - discount**steps) / (1 - discount)
-
-
-def candidate_weights(cost: Float[Array, "N C"], temperature: float) -> Float[Array, "N C"]:
-    """Return the softmax of -cost / temperature over the candidates of each pair."""
-    return jax.nn.softmax(-cost / temperature, axis=1)
-
-
-def candidates_of_each_pair(batch: Batch, count: int, pairs: int) -> tuple[Batch, Array]:
-    """Return some rows of the batch, evenly spaced, and candidates ``(N, C, S)`` for each.
-
-    The first is a state in between: from the same episode where the goal is a later state of it.
-    The others are candidates of other rows.
-    """
-    size = len(batch.action)
-    stride = max(1, size // pairs)
-    few = jax.tree.map(lambda x: x[::stride], batch)
-    steps = 1 + jnp.arange(count - 1) * max(1, size // count)
-    index = (jnp.arange(0, size, stride)[:, None] + steps) % size
-    others = batch.subgoal_candidate.observation[index]
-    return few, jnp.concatenate([few.between[:, None], others], axis=1)
-
-
-def candidate_loss(
-    subgoal_policy: SubgoalPolicy,
-    cost_of: Callable[[Batch, Subgoal], Float[Array, " M"]],
-    batch: Batch,
-    spec: EnvSpec,
-    config: "Weighed",
-) -> tuple[Float[Array, ""], Metrics]:
-    """Return the loss of eq. 17 where each pair has candidates, and a softmax, of its own.
-
-    -1/N Σ_n Σ_c w_nc log π^H(s_nc | s_n, g_n), with w_nc the softmax of -cost / λ over c.
-
-    Args:
-        subgoal_policy: π^H.
-        cost_of: The cost of one candidate for each row of a batch.
-        batch: Transitions with candidates and states in between.
-        spec: The environment.
-        config: How many candidates, for how many rows, and λ.
-    """
-    few, candidates = candidates_of_each_pair(
-        batch, config.candidates_per_pair, config.candidate_pairs
-    )
-    count = candidates.shape[1]
-    repeated = few._replace(
-        observation=jnp.repeat(few.observation, count, axis=0),
-        goal=jnp.repeat(few.goal, count, axis=0),
-    )
-    flat = candidates.reshape(-1, candidates.shape[-1])
-    cost = jax.lax.stop_gradient(cost_of(repeated, encoders.as_subgoal(spec, flat))).reshape(
-        -1, count
-    )
-    weight = candidate_weights(cost, config.advantage_temperature)
-    subgoals = subgoal_policy(few.observation[:, None], few.goal[:, None])
-    log_density = subgoals.log_density(subgoal_policy.inputs.pick(candidates))
-    loss = -(weight * log_density).sum(1).mean()
-    return loss, {
-        "subgoal/loss": loss,
-        "subgoal/advantage": ((weight - 1 / count) * -cost).sum(1).mean(),
-        "subgoal/effective_candidates": (1 / (weight**2).sum(1)).mean(),
-        "subgoal/scale": jnp.exp(subgoals.log_scale).mean(),
-    }
 
 
 def every(

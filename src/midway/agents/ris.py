@@ -128,9 +128,6 @@ def subgoal_loss(
     subgoal_policy: SubgoalPolicy, state: State, batch: Batch
 ) -> tuple[Float[Array, ""], Metrics]:
     """Return the weighted negative log-likelihood of the candidates (eq. 17)."""
-    if state.config.candidates_per_pair > 1:
-        cost_of = partial(subgoal_cost, state)
-        return beyond.candidate_loss(subgoal_policy, cost_of, batch, state.spec, state.config)
     subgoals = subgoal_policy(batch.observation, batch.goal)
     advantage = jax.lax.stop_gradient(subgoal_advantage(state, batch, subgoals.location))
     weight = functional.advantage_weights(advantage, state.config.advantage_temperature)
@@ -184,7 +181,6 @@ def update(state: State, batch: Batch, key: Key[Array, ""]) -> tuple[State, Metr
     batch = batch._replace(
         observation=features,
         subgoal_candidate=encoders.candidates(state.encoder, batch, features),
-        between=None if batch.between is None else state.encoder(batch.between),
     )
     due = partial(beyond.every, done)
     state, subgoal_metrics = due(config.subgoal_every, update_subgoal_policy, state, batch)
@@ -296,6 +292,6 @@ AGENT = Agent(
     networks=("encoder", "critic", "target_critic", "subgoal_policy", "policy", "prior_policy"),
     value=Value(encoders.on_observations(value), "value: minus discounted steps to the goal"),
     subgoals=subgoal_distribution,
-    sampling=beyond.subgoal_sampling,
+    sampling=beyond.sampling,
     freezing=Freezing(lambda state: state.encoder),
 )

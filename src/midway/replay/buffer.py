@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from midway.errors import ConfigurationError
-from midway.replay.relabel import FAR, Rows, draw, goal_rows, rows_between, source_counts
+from midway.replay.relabel import Rows, draw, goal_rows, source_counts
 from midway.replay.storage import (
     ReplayState,
     allocate,
@@ -144,16 +144,12 @@ def sample(
         return reached
 
     current, candidate = (pairs.lane, pairs.position), (others.lane, others.position)
-    goal, ahead = goal_rows(pairs, states, mix, goal_key)
+    goal = goal_rows(pairs, states, mix, goal_key)
     if wanted.unreached:
         there = is_reached(*current, read(replay, truth, *goal))
         elsewhere = jax.tree.map(lambda x: jnp.roll(x, 1), candidate)
         goal = jax.tree.map(lambda new, old: jnp.where(there, new, old), elsewhere, goal)
-        ahead = jnp.where(there, FAR, ahead)
     desired = read(replay, truth, *goal)
-    if wanted.reached_in or wanted.between:
-        at_end = is_reached(pairs.lane, pairs.last, desired)
-        ahead = jnp.where((ahead == FAR) & at_end, pairs.last - pairs.position, ahead)
 
     steps = jnp.ones(batch_size, jnp.int32)
     for number in range(1, wanted.n_step):
@@ -164,7 +160,6 @@ def sample(
     outcome = Outcome(read(replay, truth, *following), desired)
     reward, terminated = spec.task(*outcome)
     failed = read(replay, "failed", *following) & ~terminated if spec.can_fail else None
-    between = rows_between(pairs, others, ahead, goal_key)
     return Batch(
         observation=read(replay, "observation", *current),
         action=read(replay, "action", *current),
@@ -177,8 +172,6 @@ def sample(
         ),
         outcome=None if truth == "observation" else outcome,
         steps=steps.astype(jnp.float32) if wanted.n_step > 1 else None,
-        reached_in=ahead.astype(jnp.float32) if wanted.reached_in else None,
-        between=read(replay, "observation", *between) if wanted.between else None,
         failed=failed,
     )
 

@@ -9,9 +9,6 @@ from jaxtyping import Array, Bool, Int, Key, UInt32
 from midway.replay.storage import ReplayState, bounds, live
 from midway.types import RelabelMix
 
-FAR = 10**6
-"""Steps to a goal that the episode is not known to reach: more than any episode has."""
-
 
 class Rows(NamedTuple):
     """Drawn rows, and the bounds of their episodes.
@@ -83,33 +80,18 @@ def source_counts(mix: RelabelMix, batch_size: int) -> tuple[int, int, int]:
 
 def goal_rows(
     pairs: Rows, states: Rows, mix: RelabelMix, key: Key[Array, ""]
-) -> tuple[tuple[Int[Array, " B"], Int[Array, " B"]], Int[Array, " B"]]:
-    """Return lane and position of the row that holds each transition's goal, and its steps ahead.
+) -> tuple[Int[Array, " B"], Int[Array, " B"]]:
+    """Return lane and position of the row that holds the goal of each drawn transition.
 
     The batch is split into one block for each source; transitions are independent draws, so this
     favours none. Random goals are the drawn ``states``. Future goals are later states of the
-    episode, the transition's own next state included; the others are `FAR` ahead.
+    episode, the transition's own next state included.
     """
     own, random, _ = source_counts(mix, pairs.lane.shape[0])
     future = jax.tree.map(lambda leaf: leaf[own + random :], pairs)
     steps = steps_ahead(future.last - future.position, mix.future_discount, key)
     lane = jnp.concatenate([pairs.lane[:own], states.lane, future.lane])
-    rows = (pairs.first[:own], states.position, future.position + steps)
-    ahead = jnp.concatenate([jnp.full(own + random, FAR, jnp.int32), steps])
-    return (lane, jnp.concatenate(rows)), ahead
-
-
-def rows_between(
-    pairs: Rows, others: Rows, ahead: Int[Array, " B"], key: Key[Array, ""]
-) -> tuple[Int[Array, " B"], Int[Array, " B"]]:
-    """Return lane and position of a state between each transition's state and its goal.
-
-    Uniform over the way of the episode where that leads to the goal, else the drawn ``others``.
-    """
-    bits = jax.random.bits(jax.random.fold_in(key, 1), ahead.shape)
-    inside = ahead < FAR
-    position = jnp.where(inside, pairs.position + below(bits, ahead), others.position)
-    return jnp.where(inside, pairs.lane, others.lane), position
+    return lane, jnp.concatenate([pairs.first[:own], states.position, future.position + steps])
 
 
 def steps_ahead(left: Int[Array, " B"], discount: float, key: Key[Array, ""]) -> Int[Array, " B"]:

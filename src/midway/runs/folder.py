@@ -23,11 +23,14 @@ from midway.training.checkpoint import Owner
 from midway.training.config import TrainConfig
 from midway.types import Hyperparameters, JsonObject
 
-FORMAT = 3
-"""Counted up when the files of a run change; formats 1 and 2 are still understood."""
+FORMAT = 4
+"""Counted up when the files of a run change; those before are still understood."""
 
 SEALED_SINCE = 3
 """The first format whose files all have checksums."""
+
+GONE = {"hindsight_bound": False, "candidates_per_pair": 1, "candidate_pairs": 32}
+"""Agents' settings up to format 3 that are no more, and the values with which they did nothing."""
 
 OUTSIDE = ("steps", "devices", "stop_at", "on_env_error")
 """Settings that may change when a run is continued."""
@@ -129,12 +132,15 @@ class RunConfig:
 
 def _of_this_format(values: JsonObject) -> JsonObject:
     """Return the values with the names that they have in this format."""
-    if values.get("format") != 1:
+    written = values.get("format", FORMAT)
+    if written >= FORMAT:
         return values
     train, agent = dict(values["train"]), dict(values["hyperparameters"])
-    train["freeze_encoder_after"] = agent.pop("encoder_updates", 0)
-    if "image_translation" in agent:
-        agent["random_shift"] = agent.pop("image_translation")
+    agent = {name: value for name, value in agent.items() if name not in GONE}
+    if written == 1:
+        train["freeze_encoder_after"] = agent.pop("encoder_updates", 0)
+        if "image_translation" in agent:
+            agent["random_shift"] = agent.pop("image_translation")
     return {**values, "train": train, "hyperparameters": agent}
 
 
@@ -259,6 +265,20 @@ class RunFolder:
             raise ConfigurationError(
                 f"cannot make run folder {self.path}: {error.strerror}"
             ) from error
+
+    def check_goes_on(self) -> None:
+        """Check that this version learns what the run has learned so far.
+
+        Raises:
+            ConfigurationError: It was begun with a setting that is no more.
+        """
+        agent = read_json(self.config_file)["hyperparameters"]
+        on = [f"{name}={agent[name]}" for name, off in GONE.items() if agent.get(name, off) != off]
+        if on:
+            raise ConfigurationError(
+                f"{self.path} learned with {', '.join(on)}, which midway no longer has: its policy "
+                "can be evaluated and watched, the run cannot be continued"
+            )
 
     def note_resume(self, config: RunConfig) -> None:
         """Add to ``config.json`` how the run was continued, and its new number of steps."""
