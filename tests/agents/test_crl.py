@@ -1,5 +1,7 @@
 """CRL: InfoNCE by hand, its goals, and a toy problem that it solves."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -78,6 +80,21 @@ def test_it_learns_to_walk_along_a_line():
     start = jnp.linspace(-0.5, 0.5, 11)[:, None]
     action = crl.act(state, start, jnp.zeros((11, 1)), KEY, False)
     np.testing.assert_allclose(start + action, 0, atol=0.1)
+
+
+def test_what_success_is_not_measured_on_is_not_read_of_a_goal():
+    """A state at rest must look no nearer to a goal at rest than one that moves."""
+    spec = replace(SPEC, observation_shape=(2,), goal_shape=(2,))
+    state = crl.create(crl.Config(hidden=(8,)), spec, KEY)
+    observation, action = jnp.ones((3, 2)), jnp.zeros((3, 1))
+    at_rest, moving = jnp.array([[0.5, 0.0]] * 3), jnp.array([[0.5, 1.0]] * 3)
+    for asked in (
+        lambda goal: state.critic(observation, action, goal),
+        lambda goal: state.critic.logits(observation, action, goal),
+        lambda goal: crl.act(state, observation, goal, KEY, False),
+    ):
+        np.testing.assert_array_equal(asked(at_rest), asked(moving))
+        assert not np.array_equal(asked(at_rest), asked(at_rest + 1))
 
 
 def test_the_registry_has_it():

@@ -3,7 +3,9 @@
 The critic f(s, a, g) = -‖φ(s, a) - ψ(g)‖ tells the state that an action led to from those that
 others led to, so that exp f is proportional to how likely g is met in the discounted future, over
 how likely it is at all. There is no reward and no bootstrapping: goals of a batch are drawn from
-the discounted future of its states (`RelabelMix.future_discount`).
+the discounted future of its states (`RelabelMix.future_discount`). Of a goal, networks read the
+coordinates that success is measured on: told to be at rest there as well, an agent that rests
+anywhere looks nearer than one that moves.
 """
 
 from dataclasses import dataclass
@@ -17,8 +19,9 @@ from jaxtyping import Array, Float, Key, Shaped
 from midway.agent import Agent, Freezing, Value
 from midway.agents import entropy
 from midway.networks import encoder as encoders
-from midway.networks import optimizer
+from midway.networks import inputs, optimizer
 from midway.networks.encoder import Encoder
+from midway.networks.inputs import PairInputs
 from midway.networks.mlp import MLP, PRECISIONS, Precision
 from midway.networks.policies import GaussianPolicy
 from midway.settings import check, setting
@@ -56,6 +59,7 @@ class ContrastiveCritic(eqx.Module):
 
     state_action: MLP
     goal: MLP
+    inputs: PairInputs
 
     def __call__(
         self,
@@ -64,7 +68,8 @@ class ContrastiveCritic(eqx.Module):
         goal: Float[Array, "B G"],
     ) -> Float[Array, " B"]:
         """Return f of each triple."""
-        return distance_logit(self.state_action(observation, action), self.goal(goal))
+        ours, theirs = self.state_action(observation, action), self.inputs(observation, goal)[1]
+        return distance_logit(ours, self.goal(theirs))
 
     def logits(
         self,
@@ -73,8 +78,8 @@ class ContrastiveCritic(eqx.Module):
         goal: Float[Array, "B G"],
     ) -> Float[Array, "B B"]:
         """Return f of every state and action (rows) with every goal (columns)."""
-        ours, theirs = self.state_action(observation, action), self.goal(goal)
-        return distance_logit(ours[:, None], theirs[None])
+        ours, theirs = self.state_action(observation, action), self.inputs(observation, goal)[1]
+        return distance_logit(ours[:, None], self.goal(theirs)[None])
 
 
 def distance_logit(
@@ -197,12 +202,14 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     encoder_key, first_key, second_key, policy_key = jax.random.split(key, 4)
     observation_size, goal_size = encoders.feature_sizes(spec)
     encoder = encoders.create(spec, config, encoder_key)
+    read = inputs.create(spec, "coordinates", encoder)
+    goal_size = read.size(goal_size)
 
     def embed(size: int, key: Key[Array, ""]) -> MLP:
         return MLP(size, config.hidden, config.features, config.precision, key=key)
 
     critic = ContrastiveCritic(
-        embed(observation_size + spec.action_dim, first_key), embed(goal_size, second_key)
+        embed(observation_size + spec.action_dim, first_key), embed(goal_size, second_key), read
     )
     policy = GaussianPolicy(
         observation_size + goal_size,
@@ -210,6 +217,7 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
         config.hidden,
         config.precision,
         key=policy_key,
+        inputs=read,
     )
     log_entropy_coefficient = jnp.zeros(())
     return State(
