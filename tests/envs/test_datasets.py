@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import midway
+import tiny
 from midway.envs.datasets import trajectories
 from midway.envs.foreign import Settings, describe
 from midway.errors import ConfigurationError
@@ -18,17 +19,7 @@ minari = pytest.importorskip("minari")
 pytestmark = pytest.mark.filterwarnings("ignore")
 
 NAME = "tests/plane-v0"
-TINY = {
-    "hidden": (8,),
-    "batch_size": 8,
-    "num_envs": 2,
-    "random_steps": 20,
-    "replay_capacity": 500,
-    "evaluate_every": 60,
-    "evaluation_episodes": 2,
-    "log_every": 20,
-    "checkpoint_every": 60,
-}
+TINY = tiny.TINY | {"num_envs": 2, "random_steps": 20, "checkpoint_every": 60}
 
 
 @pytest.fixture

@@ -19,23 +19,14 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
 import midway
+import tiny
 from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, admit, describe, with_limit
 from midway.envs.goals_in_info import GoalsInInfo
 from midway.envs.sources import source
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
 from midway.training import seeds as midway_seeds
 
-TINY = {
-    "hidden": (8,),
-    "batch_size": 8,
-    "num_envs": 2,
-    "random_steps": 20,
-    "replay_capacity": 500,
-    "evaluate_every": 60,
-    "evaluation_episodes": 2,
-    "log_every": 20,
-    "checkpoint_every": 60,
-}
+TINY = tiny.TINY | {"num_envs": 2, "random_steps": 20, "checkpoint_every": 60}
 RIGHT = np.array([[1.0, 0.0], [1.0, 0.0]], np.float32)
 
 

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import midway
+import tiny
 from midway import reports
 from midway.envs import layouts
 from midway.envs.geodesic import geodesic_distance
@@ -16,17 +17,7 @@ from midway.envs.layouts import Layout
 from midway.envs.registry import own_maze
 from midway.errors import ConfigurationError
 
-TINY = {
-    "hidden": (8,),
-    "batch_size": 8,
-    "num_envs": 2,
-    "random_steps": 20,
-    "replay_capacity": 2_000,
-    "evaluate_every": 60,
-    "evaluation_episodes": 2,
-    "log_every": 20,
-    "checkpoint_every": 60,
-}
+TINY = tiny.TINY | {"num_envs": 2, "random_steps": 20, "checkpoint_every": 60}
 
 
 @pytest.mark.parametrize("name", layouts.names())

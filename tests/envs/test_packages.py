@@ -12,6 +12,7 @@ import pytest
 from gymnasium.utils.seeding import np_random
 
 import midway
+import tiny
 from midway.cli.main import main
 from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, describe
 from midway.envs.success import AskedRule, DistanceRule
@@ -20,15 +21,10 @@ from midway.errors import ConfigurationError
 pytestmark = pytest.mark.filterwarnings("ignore")
 
 EPISODES = 3
-TINY = {
-    "hidden": (8,),
-    "batch_size": 8,
+TINY = tiny.TINY | {
     "num_envs": 2,
     "random_steps": 20,
-    "replay_capacity": 2_000,
-    "evaluate_every": 60,
     "evaluation_episodes": 1,
-    "log_every": 20,
     "checkpoint_every": 60,
 }
 CASES = {

@@ -6,22 +6,13 @@ from pathlib import Path
 import pytest
 
 import midway
+import tiny
 from midway import tables
 from midway.errors import ConfigurationError
 from midway.reports import report
 from midway.reports.runs import read
 
-TINY: dict[str, object] = {
-    "hidden": (8,),
-    "batch_size": 8,
-    "num_envs": 4,
-    "random_steps": 40,
-    "replay_capacity": 2_000,
-    "evaluate_every": 60,
-    "evaluation_episodes": 2,
-    "log_every": 20,
-    "steps": 120,
-}
+TINY = tiny.TINY | {"steps": 120}
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import midway
+import tiny
 from midway import api, tables
 from midway.cli.main import main
 from midway.errors import ConfigurationError
@@ -21,12 +22,7 @@ from midway.training.state import Training
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 
-TINY: dict[str, object] = {
-    "hidden": (8,),
-    "batch_size": 8,
-    "num_envs": 4,
-    "random_steps": 40,
-    "replay_capacity": 2_000,
+TINY = tiny.TINY | {
     "evaluate_every": 20,
     "evaluation_episodes": 10,
     "log_every": 60,

@@ -12,6 +12,7 @@ import pytest
 from gymnasium import spaces
 
 import midway
+import tiny
 from midway.envs.registry import make_vec
 from midway.errors import BrokenEnvironmentError
 from midway.replay.buffer import create, num_transitions
@@ -20,15 +21,12 @@ from midway.training.checkpoint import steps_in
 from midway.training.collect import Collector
 from midway.training.state import Training
 
-TINY: dict[str, object] = {
-    "hidden": (8,),
-    "batch_size": 8,
+TINY = tiny.TINY | {
     "num_envs": 2,
     "random_steps": 20,
     "replay_capacity": 400,
     "evaluate_every": 1_000,
     "evaluation_episodes": 1,
-    "log_every": 20,
     "checkpoint_every": 1_000,
     "steps": 80,
 }

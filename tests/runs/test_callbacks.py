@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import midway
+import tiny
 from midway import tables
 from midway.api import Run
 from midway.cluster.jobs import Job, finished
@@ -20,18 +21,7 @@ from midway.training.evaluate import Episode, Evaluation
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 
-TINY = {
-    "hidden": (8,),
-    "batch_size": 8,
-    "num_envs": 4,
-    "random_steps": 16,
-    "replay_capacity": 2_000,
-    "evaluation_episodes": 2,
-    "evaluate_every": 60,
-    "log_every": 20,
-    "checkpoint_every": 60,
-    "steps": 120,
-}
+TINY = tiny.TINY | {"random_steps": 16, "checkpoint_every": 60, "steps": 120}
 
 
 def train(path: Path, **options: Any) -> Run:

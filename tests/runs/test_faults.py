@@ -17,6 +17,7 @@ import pytest
 
 import midway
 import short
+import tiny
 from midway.api import Run
 from midway.cli.main import main
 from midway.errors import BrokenEnvironmentError, NonFiniteObservationError
@@ -31,18 +32,7 @@ from midway.training.state import Training
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 
-TINY: dict[str, object] = {
-    "hidden": (8,),
-    "batch_size": 8,
-    "num_envs": 4,
-    "random_steps": 40,
-    "replay_capacity": 2_000,
-    "evaluate_every": 60,
-    "evaluation_episodes": 2,
-    "log_every": 20,
-    "checkpoint_every": 40,
-    "steps": 120,
-}
+TINY = tiny.TINY | {"steps": 120}
 CHANGES = [f"{name}={value}" for name, value in TINY.items()]
 
 

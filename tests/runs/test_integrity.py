@@ -10,24 +10,14 @@ from pathlib import Path
 import pytest
 
 import midway
+import tiny
 from midway import api
 from midway.errors import ConfigurationError
 from midway.runs import complete
 from midway.runs.folder import RunFolder, write_json
 from midway.training.checkpoint import Checkpoints
 
-TINY = {
-    "hidden": (8,),
-    "batch_size": 8,
-    "num_envs": 4,
-    "random_steps": 40,
-    "replay_capacity": 2_000,
-    "evaluate_every": 60,
-    "evaluation_episodes": 2,
-    "log_every": 20,
-    "checkpoint_every": 40,
-    "steps": 120,
-}
+TINY = tiny.TINY | {"steps": 120}
 
 
 @pytest.fixture(scope="module")

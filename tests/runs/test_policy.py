@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import midway
+import tiny
 from midway import files
 from midway.envs import registry
 from midway.envs.push import IMAGE_SPEC, STATE_SPEC
@@ -17,15 +18,7 @@ from midway.runs.folder import FORMAT, RunFolder
 from midway.types import EnvSpec, UnknownTask
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
-TINY = {
-    "hidden": (8,),
-    "batch_size": 8,
-    "num_envs": 4,
-    "random_steps": 40,
-    "replay_capacity": 2_000,
-    "evaluation_episodes": 2,
-    "steps": 80,
-}
+TINY = tiny.TINY | {"steps": 80}
 
 
 def test_a_policy_loads_without_an_environment(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import tiny
 from midway import api
 from midway.envs.registry import make_vec
 from midway.reports.runs import read
@@ -15,17 +16,7 @@ from midway.runs.folder import RunFolder
 from midway.training import loop, state
 from midway.training.evaluate import run_episodes
 
-TINY = {
-    "hidden": (8,),
-    "batch_size": 8,
-    "num_envs": 4,
-    "random_steps": 40,
-    "replay_capacity": 5_000,
-    "evaluation_episodes": 2,
-    "evaluate_every": 10_000,
-    "checkpoint_every": 10_000,
-    "log_every": 20,
-}
+TINY = tiny.TINY | {"replay_capacity": 5_000, "evaluate_every": 10_000, "checkpoint_every": 10_000}
 ON_ITS_BACK = (0.0, 1.0, 0.0, 0.0)
 ON_ITS_SIDE = (np.cos(0.77), np.sin(0.77), 0.0, 0.0)
 """A roll of 88 degrees."""
