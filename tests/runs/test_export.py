@@ -19,7 +19,8 @@ from midway.training.step import create_state
 
 
 def untrained(env: str, agent: str, **changes: Any) -> Policy:
-    config = configuration.configure(env, agent, changes={"hidden": (8, 8), **changes})
+    small = {"hidden": (8, 8), "precision": "f32"}  # on any machine
+    config = configuration.configure(env, agent, changes=small | changes)
     spec, made = midway.make_vec(env).goal_spec, registry.get(agent)
     state = create_state(made, config.hyperparameters, spec, jax.random.key(1))
     return Policy(made, state, config, spec, 7)
