@@ -57,18 +57,12 @@ def assert_same_run(first: Path, second: Path) -> None:
     assert contents(first) == contents(second)
 
 
-@pytest.fixture(scope="module", params=["ris", "sac"])
-def whole_run(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, short_episodes: None
-) -> Path:
-    path = tmp_path_factory.mktemp("whole") / request.param
-    run = midway.train("point-u", agent=request.param, seed=3, out=path, changes=SMALL)
-    assert run.finished
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory: pytest.TempPathFactory, short_episodes: None) -> Path:
+    """Return a run of RIS; SAC's are killed and continued in runs/test_kills.py."""
+    path = tmp_path_factory.mktemp("whole") / "run"
+    assert midway.train("point-u", seed=3, out=path, changes=SMALL).finished
     return path
-
-
-def agent_of(path: Path) -> str:
-    return RunFolder(path).load_config().agent
 
 
 def interrupt_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
@@ -89,9 +83,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(
 ) -> None:
     with monkeypatch.context() as patch:
         interrupt_after(patch, stop)
-        run = midway.train(
-            "point-u", agent=agent_of(whole_run), seed=3, out=tmp_path / "run", changes=SMALL
-        )
+        run = midway.train("point-u", seed=3, out=tmp_path / "run", changes=SMALL)
     assert not run.finished
     assert Checkpoints(run.path / "checkpoints").latest() == stop
     assert midway.resume(run.path).finished
@@ -99,10 +91,9 @@ def test_interrupted_and_resumed_equals_uninterrupted(
 
 
 def test_same_seed_same_run_and_other_seed_another(whole_run: Path, tmp_path: Path) -> None:
-    agent = agent_of(whole_run)
-    midway.train("point-u", agent=agent, seed=3, out=tmp_path / "same", changes=SMALL)
+    midway.train("point-u", seed=3, out=tmp_path / "same", changes=SMALL)
     assert_same_run(whole_run, tmp_path / "same")
-    midway.train("point-u", agent=agent, seed=4, out=tmp_path / "other", changes=SMALL)
+    midway.train("point-u", seed=4, out=tmp_path / "other", changes=SMALL)
     assert rows(whole_run / "metrics.csv") != rows(tmp_path / "other" / "metrics.csv")
 
 
@@ -112,8 +103,7 @@ def test_killed_run_resumes_from_its_newest_whole_checkpoint(
     """SIGKILL at arbitrary moments, several times in a row, until the run is through."""
     path = tmp_path / "run"
     changes = [f"{name}={value}" for name, value in SMALL.items()]
-    command = ["train", "point-u", "--agent", agent_of(whole_run), "--seed", "3"]
-    command += ["--out", str(path), "--set", *changes]
+    command = ["train", "point-u", "--seed", "3", "--out", str(path), "--set", *changes]
     process = start(command)
     wait_for(lambda: list((path / "checkpoints").glob("[0-9]*")), process)
     process.kill()
@@ -149,8 +139,7 @@ def wait_for(condition: object, process: subprocess.Popen[bytes], log: Path | No
 
 def test_resume_with_more_steps_goes_on(whole_run: Path, tmp_path: Path) -> None:
     shorter = {**SMALL, "steps": 200}
-    agent = agent_of(whole_run)
-    run = midway.train("point-u", agent=agent, seed=3, out=tmp_path / "run", changes=shorter)
+    run = midway.train("point-u", seed=3, out=tmp_path / "run", changes=shorter)
     assert run.finished
     assert midway.resume(run.path, steps=400).finished
     assert rows(run.path / "evaluation.csv") == rows(whole_run / "evaluation.csv")
