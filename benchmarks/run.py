@@ -30,7 +30,7 @@ ROBOTICS = {
     "PointMaze_UMaze-v3": 32_000,
     "PointMaze_Medium-v3": 64_000,
     "FetchReach-v4": 12_000,
-    "FetchPush-v4": 120_000,
+    "FetchPush-v4": 180_000,
     "PandaPush-v3": 120_000,
 }
 """Environment steps on the environments of others; 50 episodes an evaluation take their time."""

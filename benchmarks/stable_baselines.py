@@ -25,6 +25,8 @@ import panda_gym
 from run import RESULTS, ROBOTICS
 from stable_baselines3 import SAC, HerReplayBuffer
 
+from midway.envs import packages
+
 PACKAGES = (gymnasium_robotics, panda_gym)
 """They register their environments when they are imported."""
 
@@ -42,6 +44,7 @@ def main() -> None:
     parser.add_argument("env", choices=ROBOTICS)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    packages.fit_to_mujoco()
     folder = RESULTS / "robotics" / f"{arguments.env}-sb3-seed{arguments.seed}"
     folder.mkdir(parents=True, exist_ok=True)
     config = {
