@@ -28,7 +28,7 @@ hypothesis.settings.load_profile("midway")
 MAY_SKIP = "MIDWAY_TESTS_MAY_SKIP"
 """Environment variable: with ``no``, as in CI, a skipped test fails the session."""
 
-MUCH = 800_000_000
+MUCH = 700_000_000
 """Bytes in memory that a worker lets go of its compiled programs at, before the next test."""
 
 A_LITTLE = 100_000_000

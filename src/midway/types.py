@@ -1,6 +1,6 @@
 """Containers and contracts that every floor shares."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import Field, asdict, dataclass, fields, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
@@ -29,7 +29,14 @@ Info: TypeAlias = dict[str, NumPyArray]
 Step: TypeAlias = tuple[Observations, NumPyArray, NumPyArray, NumPyArray, Info]
 """Observations, reward, terminated, truncated and info."""
 Options: TypeAlias = Mapping[str, Any]
-"""What a user wants of a reset, checked by the environment: ``reset_mask``, ``task`` and others."""
+"""Values by name that whoever reads them checks: of a reset ``reset_mask``, ``task`` and others."""
+
+OwnEnv: TypeAlias = Any
+"""An environment of others, with methods of its own: ``compute_reward`` and the like."""
+NamedValues: TypeAlias = dict[str, Any]
+"""What an environment of others says besides, or is told."""
+Function: TypeAlias = Callable[..., Any]
+"""A function of a user or of a package, whose arguments it says itself."""
 
 LARGEST_SIZE = 1_000_000
 """Entries along an axis of what environments show, and steps of an episode, at most."""

@@ -11,7 +11,7 @@ from midway.envs.group import action_bounds
 from midway.envs.reading import GOAL_KEYS, STATE_KEYS, readings
 from midway.envs.success import judge
 from midway.errors import ConfigurationError, needing
-from midway.types import NumPyArray, Trajectory
+from midway.types import NumPyArray, OwnEnv, Trajectory
 
 
 def trajectories(dataset: str, foreign: Foreign) -> Iterator[Trajectory]:
@@ -91,7 +91,7 @@ def _open(dataset: str) -> Any:
         raise ConfigurationError(f"--data {dataset}: cannot be read: {text}") from error
 
 
-def _check(dataset: str, found: Any, foreign: Foreign, env: Any) -> None:
+def _check(dataset: str, found: Any, foreign: Foreign, env: OwnEnv) -> None:
     """Compare the spaces of a dataset with those of the environment.
 
     Raises:

@@ -12,7 +12,7 @@ import itertools
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from midway.envs.success import (
     reference_of,
 )
 from midway.errors import ConfigurationError
+from midway.types import Function, OwnEnv
 
 Question: TypeAlias = Callable[[Array, Array], Array]
 """``(achieved, desired) -> reached`` over a batch."""
@@ -54,8 +55,8 @@ class Evidence:
 
     name: str
     source: Source
-    judge: Any
-    env: Any
+    judge: OwnEnv
+    env: OwnEnv
     goal_shape: tuple[int, ...]
     probes: Probes
     more: Callable[[int], Probes]
@@ -68,7 +69,7 @@ class _UnfitError(Exception):
 def given(
     evidence: Evidence,
     success_distance: float | None,
-    success_function: str | Callable[..., Any] | None,
+    success_function: str | Function | None,
 ) -> Rule | None:
     """Return the rule that the user gave, nothing where there is none.
 
@@ -209,7 +210,7 @@ def _check_word(probes: Probes, reached: Array) -> None:
 
 
 def _answers_batches(
-    judge: Any, rule: AskedRule, achieved: Array, desired: Array, answers: Array
+    judge: OwnEnv, rule: AskedRule, achieved: Array, desired: Array, answers: Array
 ) -> bool:
     """Return whether a method answers for a batch as it does for the pairs, at several sizes."""
     batched = dataclasses.replace(rule, batched=True)
@@ -358,7 +359,7 @@ def _nearest(probes: Probes) -> float:
     return float(np.linalg.norm(probes.achieved - probes.desired, axis=1).min())
 
 
-def _given_function(evidence: Evidence, function: str | Callable[..., Any]) -> FunctionRule:
+def _given_function(evidence: Evidence, function: str | Function) -> FunctionRule:
     """Return a rule that asks a function of the user.
 
     Raises:
@@ -389,11 +390,11 @@ def _given_function(evidence: Evidence, function: str | Callable[..., Any]) -> F
     return FunctionRule(reference, how, kept)
 
 
-def _how(function: Callable[..., Any], achieved: Array, desired: Array, reached: Array) -> How:
+def _how(function: Function, achieved: Array, desired: Array, reached: Array) -> How:
     """Return the fastest way to ask a function in which it answers the same."""
     import jax
 
-    def same(answer: Callable[..., Any]) -> bool:
+    def same(answer: Function) -> bool:
         try:
             values = np.asarray(answer(achieved, desired))
         except Exception:  # it is not written for this way

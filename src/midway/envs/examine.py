@@ -11,7 +11,12 @@ from midway.envs.deciding import REMEDY
 from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, describe
 from midway.envs.success import judge
 from midway.errors import ConfigurationError
-from midway.types import EnvSpec
+from midway.types import (
+    EnvSpec,
+    NamedValues,
+    NumPyArray,
+    OwnEnv,
+)
 
 Finding: TypeAlias = tuple[str, str, bool]
 """What was looked at, what was found, and whether it is well."""
@@ -52,7 +57,7 @@ class Tally:
 
 
 def examine(
-    env: Any,
+    env: OwnEnv,
     settings: Settings | None = None,
     num_envs: int = 16,
     seconds: float = SECONDS,
@@ -147,12 +152,12 @@ def _random_episodes(foreign: Foreign, num_envs: int, seconds: float) -> Tally:
     return tally
 
 
-def _note_begun(tally: Tally, info: dict[str, Any], mask: Any) -> None:
+def _note_begun(tally: Tally, info: NamedValues, mask: NumPyArray) -> None:
     tally.begun += int(mask.sum())
     tally.at_once += int((info["is_success"] & mask).sum())
 
 
-def _note_ended(tally: Tally, info: dict[str, Any], ended: Any) -> None:
+def _note_ended(tally: Tally, info: NamedValues, ended: NumPyArray) -> None:
     for copy in np.flatnonzero(ended):
         reached, failed = info["is_success"][copy], info["failed"][copy]
         kind = tally.reached if reached else tally.failed if failed else tally.late

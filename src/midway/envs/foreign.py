@@ -20,7 +20,7 @@ from jaxtyping import Bool, Int, Shaped
 from midway.envs import deciding, success
 from midway.envs.group import Group
 from midway.envs.probes import Probes, probe
-from midway.envs.reading import readings
+from midway.envs.reading import AnySpace, readings
 from midway.envs.simulation import num_cores
 from midway.envs.sources import Source, source
 from midway.envs.success import Rule, judge, reference_of
@@ -32,7 +32,19 @@ from midway.errors import (
     NonFiniteObservationError,
 )
 from midway.plain import check_kinds
-from midway.types import DistanceTask, EnvSpec, Info, Observations, Options, Step, UnknownTask
+from midway.types import (
+    DistanceTask,
+    EnvSpec,
+    Function,
+    Info,
+    JsonObject,
+    NamedValues,
+    Observations,
+    Options,
+    OwnEnv,
+    Step,
+    UnknownTask,
+)
 
 CHEAP_SECONDS = 0.002
 """Environments whose steps take less time together are stepped without other processes."""
@@ -54,7 +66,7 @@ class Settings:
     """
 
     success_distance: float | None = None
-    success_function: str | Callable[..., Any] | None = None
+    success_function: str | Function | None = None
     max_episode_steps: int | None = None
     action_bound: float | None = None
     step_seconds: float = 600.0
@@ -100,14 +112,14 @@ class Foreign:
         return f"{self.spec.name}: a goal is reached {self.rule.description}"
 
     @property
-    def stored(self) -> dict[str, Any] | None:
+    def stored(self) -> JsonObject | None:
         """What a run folder stores; None where only this process can make the environment."""
         try:
             return self.to_json()
         except ConfigurationError:
             return None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return what a run folder stores.
 
         Raises:
@@ -122,7 +134,7 @@ class Foreign:
         return stored | {"settings": settings, "spec": spec, "seconds": self.seconds}
 
     @staticmethod
-    def from_json(stored: Mapping[str, Any]) -> "Foreign":
+    def from_json(stored: Options) -> "Foreign":
         """Return the environment that ``to_json`` was taken from; nothing is decided again.
 
         Raises:
@@ -145,9 +157,9 @@ class Foreign:
 
 
 def describe(
-    env: Any,
+    env: OwnEnv,
     settings: Settings | None = None,
-    kwargs: Mapping[str, Any] | None = None,
+    kwargs: Options | None = None,
     imports: tuple[str, ...] = (),
 ) -> Foreign:
     """Return an environment with all that must be decided about it; a few episodes are run.
@@ -211,7 +223,7 @@ def describe(
     return Foreign(origin, spec, settings, seen.seconds)
 
 
-EnvLike: TypeAlias = str | Foreign | gymnasium.Env[Any, Any] | Callable[..., Any]
+EnvLike: TypeAlias = str | Foreign | gymnasium.Env[Any, Any] | Function
 """What stands for an environment: a name, what `describe` returned, what ``gymnasium.make``
 returned, or what makes it, such as its class."""
 
@@ -374,14 +386,14 @@ class ForeignVectorEnv(GoalVectorEnv):
         """Return a picture of each environment; only with a render mode and one process."""
         return tuple(self._group.render()) if self._group and self.render_mode else None
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """End the processes and close the environments."""
         if getattr(self, "_workers", None) is not None:
             self._workers.close()  # type: ignore[union-attr]
         if getattr(self, "_group", None) is not None:
             self._group.close()  # type: ignore[union-attr]
 
-    def _begin(self, copies: Int[Array, " n"], options: Mapping[str, Any]) -> None:
+    def _begin(self, copies: Int[Array, " n"], options: Options) -> None:
         mask, seeds = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.int64)
         for copy in copies:
             mask[copy], seeds[copy] = True, self.generators[copy].integers(2**31)
@@ -396,7 +408,7 @@ class ForeignVectorEnv(GoalVectorEnv):
     def _ask(
         self,
         ask: Callable[[Workers], Answer],
-        options: dict[str, Any] | None,
+        options: NamedValues | None,
         actions: Array | None,
     ) -> None:
         """Reset by options, or step by actions, and keep what the environments show.
@@ -466,7 +478,7 @@ class ForeignVectorEnv(GoalVectorEnv):
 
     def _info(
         self, achieved: Array, desired: Array, reached: Array, mask: Bool[Array, " num_envs"]
-    ) -> dict[str, Any]:
+    ) -> NamedValues:
         reached = self._as_it_says(achieved, desired, reached)
         return super()._info(achieved, desired, reached, mask)
 
@@ -549,7 +561,7 @@ def _places(observations: Shaped[Array, "N S"], achieved: Shaped[Array, "N G"]) 
     return tuple(same.argmax(0).tolist()) if same.any(0).all() else ()
 
 
-def _checked_actions(name: str, space: gymnasium.Space[Any], bound: float | None) -> spaces.Box:
+def _checked_actions(name: str, space: AnySpace, bound: float | None) -> spaces.Box:
     """Return the space of continuous actions.
 
     Raises:
@@ -567,7 +579,7 @@ def _checked_actions(name: str, space: gymnasium.Space[Any], bound: float | None
     return space
 
 
-def _limit(name: str, env: Any, given: int | None) -> int:
+def _limit(name: str, env: OwnEnv, given: int | None) -> int:
     """Return the number of steps of an episode.
 
     Raises:
@@ -586,7 +598,7 @@ def _limit(name: str, env: Any, given: int | None) -> int:
     return int(limit)
 
 
-def _wrapped_limit(env: Any) -> int | None:
+def _wrapped_limit(env: OwnEnv) -> int | None:
     try:
         return int(env.get_wrapper_attr("_max_episode_steps"))
     except (AttributeError, TypeError, ValueError):

@@ -4,15 +4,19 @@ import contextlib
 import json
 import os
 import signal
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from midway.envs.reading import Array, Reading, readings, word_of
+from midway.envs.reading import AnySpace, Array, Reading, readings, word_of
 from midway.envs.sources import Source, printing_to_stderr
+from midway.types import (
+    NamedValues,
+    Options,
+    OwnEnv,
+)
 
 FLAGS = ("terminated", "truncated", "word", "broken")
 """What each environment said of its last step; ``word``: of success, -1 where it said nothing;
@@ -44,7 +48,7 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
     def __init__(
         self,
         source: Source,
-        spaces_of: tuple[spaces.Space[Any], spaces.Box],
+        spaces_of: tuple[AnySpace, spaces.Box],
         first: int,
         size: int,
         total: int,
@@ -58,14 +62,14 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
         self.limit = max_episode_steps
         self.readings: dict[str, Reading] = readings(source.reference, spaces_of[0])
         self.low, self.high = action_bounds(spaces_of[1], action_bound)
-        boxes: dict[str, spaces.Space[Any]] = {
+        boxes: dict[str, AnySpace] = {
             name: reading.box(size) for name, reading in self.readings.items()
         }
         flags = {name: spaces.Box(-1, 1, (size,), np.int8) for name in FLAGS}
         shown = spaces.Dict(boxes | flags)
-        self.observation_space: spaces.Space[Any] = shown
+        self.observation_space: AnySpace = shown
         self.action_space = spaces.Box(-1, 1, (size, self.low.size), np.float32)
-        self.envs: list[Any] = [None for _ in self.places]
+        self.envs: list[OwnEnv] = [None for _ in self.places]
         self.busy = np.zeros(total, np.uint8)
         if busy is not None:
             self.busy = np.memmap(busy, np.uint8, "r+", shape=(total,))
@@ -75,8 +79,8 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
         }
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Array], dict[str, Any]]:
+        self, *, seed: int | None = None, options: NamedValues | None = None
+    ) -> tuple[dict[str, Array], NamedValues]:
         """Start new episodes in the environments of the mask."""
         mask, seeds = (options or {})["mask"], (options or {})["seeds"]
         for place, index in enumerate(self.places):
@@ -88,7 +92,7 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
                     self._hold(place, observation, info, False, False)
         return self.held, self._take_raised()
 
-    def step(self, actions: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+    def step(self, actions: Array) -> tuple[dict[str, Array], float, bool, bool, NamedValues]:
         """Move every environment by one step, by actions in [-1, 1]; NaN: it rests."""
         wanted = scaled(actions, self.low, self.high)
         for place, env in enumerate(self.envs):
@@ -101,7 +105,7 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
                 self._hold(place, observation, info, terminated, truncated)
         return self.held, 0.0, False, False, self._take_raised()
 
-    def render(self) -> list[Any]:  # type: ignore[override]
+    def render(self) -> list[object]:  # type: ignore[override]
         """Return a picture of each environment."""
         return [env.render() for env in filter(None, self.envs)]
 
@@ -133,13 +137,11 @@ class Group(gymnasium.Env[dict[str, Array], Array]):
         finally:
             self.busy[copy] = False
 
-    def _take_raised(self) -> dict[str, Any]:
+    def _take_raised(self) -> NamedValues:
         raised, self.raised = self.raised, {}
         return {"raised": json.dumps(raised)} if raised else {}
 
-    def _hold(
-        self, place: int, observation: Mapping[str, Any], info: Mapping[str, Any], *ends: bool
-    ) -> None:
+    def _hold(self, place: int, observation: Options, info: Options, *ends: bool) -> None:
         for name, reading in self.readings.items():
             self.held[name][place] = reading.read(observation[name])
         self._flag(place, *ends, word_of(info)[1], False)

@@ -1,7 +1,7 @@
 """Between the spaces of an environment itself and what agents see of it, without stepping it."""
 
-from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
@@ -12,7 +12,7 @@ from midway.envs.group import action_bounds, scaled
 from midway.envs.reading import GOAL_KEYS, Array, readings
 from midway.envs.success import judge
 from midway.errors import ConfigurationError
-from midway.types import EnvSpec
+from midway.types import EnvSpec, Options
 
 
 class Seen(NamedTuple):
@@ -29,7 +29,7 @@ class Seen(NamedTuple):
     single: bool
 
 
-def seen(spec: EnvSpec, foreign: Foreign | None, observation: Mapping[str, Any]) -> Seen:
+def seen(spec: EnvSpec, foreign: Foreign | None, observation: Options) -> Seen:
     """Return what agents see of a dictionary that the environment itself observes.
 
     Args:
@@ -52,7 +52,7 @@ def seen(spec: EnvSpec, foreign: Foreign | None, observation: Mapping[str, Any])
         raise _refused(spec, "desired_goal", shape, goal_shape)
 
     def rows(key: str) -> Array:
-        shown: Iterable[Any] = [observation[key]]
+        shown: Iterable[object] = [observation[key]]
         if not single:
             shown = iterate(batch_space(space[key], shape[0]), observation[key])
         batch = np.stack([read[key].read(row) for row in shown])
@@ -88,7 +88,7 @@ def appends_goal(spec: EnvSpec, foreign: Foreign | None) -> bool:
     return read["observation"].shape != spec.observation_shape
 
 
-def _own(spec: EnvSpec, observation: Mapping[str, Any]) -> Seen:
+def _own(spec: EnvSpec, observation: Options) -> Seen:
     """Return the observation of an environment of midway's own, which agents see as it is."""
     states = np.asarray(observation["observation"], spec.observation_dtype)
     goals = np.asarray(observation["desired_goal"], spec.observation_dtype)

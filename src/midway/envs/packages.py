@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from midway.envs.goals_in_info import GoalsInInfo
+from midway.types import OwnEnv
 
 PACKAGES = {
     "gymnasium_robotics": r"(PointMaze|AntMaze|Fetch|Hand|Adroit|FrankaKitchen)",
@@ -35,7 +36,7 @@ def hint(gym_id: str) -> str | None:
     return f"pip install {package.replace('_', '-')}"
 
 
-def adapted(gym_id: str, env: Any) -> Any:
+def adapted(gym_id: str, env: OwnEnv) -> OwnEnv:
     """Return an environment with its goal in the observation, where its package has it in info."""
     if _package(gym_id) != "ogbench":
         return env

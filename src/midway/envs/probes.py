@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,10 @@ from midway.envs.group import action_bounds
 from midway.envs.reading import Array, Reading, word_of
 from midway.envs.sources import printing_to_stderr
 from midway.errors import ConfigurationError
+from midway.types import (
+    NamedValues,
+    OwnEnv,
+)
 
 RESETS = 5
 STEPS = 200
@@ -63,7 +67,7 @@ class Probes:
 
 
 def random_moments(
-    env: Any,
+    env: OwnEnv,
     readings: dict[str, Reading],
     action_bound: float | None,
     limit: int,
@@ -101,7 +105,7 @@ def random_moments(
 
 def probe(
     name: str,
-    env: Any,
+    env: OwnEnv,
     readings: dict[str, Reading],
     action_bound: float | None,
     limit: int,
@@ -158,10 +162,10 @@ def check_finite(name: str, moment: Moment) -> None:
 
 def _moment(
     readings: dict[str, Reading],
-    observation: Any,
-    info: Any,
-    terminated: Any,
-    truncated: Any,
+    observation: NamedValues,
+    info: NamedValues,
+    terminated: object,
+    truncated: object,
     elapsed: int,
 ) -> Moment:
     entries = {name: reading.read(observation[name]).copy() for name, reading in readings.items()}

@@ -1,6 +1,6 @@
 """What an environment that is not midway's observes, as the arrays that midway knows."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -9,8 +9,10 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatdim, flatten
 
 from midway.errors import ConfigurationError
+from midway.types import NumPyArray, Options
 
-Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
+Array: TypeAlias = NumPyArray
+AnySpace: TypeAlias = spaces.Space[Any]
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 STATE_KEYS = ("achieved_state", "desired_state")
@@ -30,7 +32,7 @@ class Reading:
 
     shape: tuple[int, ...]
     dtype: str
-    read: Callable[[Any], Array] = field(compare=False)
+    read: Callable[[object], Array] = field(compare=False)
 
     @property
     def is_image(self) -> bool:
@@ -44,7 +46,7 @@ class Reading:
         return spaces.Box(low, high, shape, np.dtype(self.dtype).type)
 
 
-def readings(name: str, space: spaces.Space[Any]) -> dict[str, Reading]:
+def readings(name: str, space: AnySpace) -> dict[str, Reading]:
     """Return how each entry of a goal environment's observation is read.
 
     Numbers become vectors, also from dictionaries and tuples; images become 84 x 84 x 3 pixels.
@@ -77,13 +79,13 @@ def readings(name: str, space: spaces.Space[Any]) -> dict[str, Reading]:
     return found
 
 
-def _named(space: spaces.Space[Any]) -> str:
+def _named(space: AnySpace) -> str:
     if isinstance(space, spaces.Dict):
         return "one of " + ", ".join(space)
     return type(space).__name__
 
 
-def _reading(name: str, key: str, space: spaces.Space[Any]) -> Reading:
+def _reading(name: str, key: str, space: AnySpace) -> Reading:
     if isinstance(space, spaces.Box) and _shows_image(space):
         return Reading((IMAGE_SIDE, IMAGE_SIDE, 3), "uint8", _image_reader(name, key, space))
     dtype = "float32" if key == "observation" else "float64"
@@ -107,7 +109,7 @@ def _shows_image(box: spaces.Box) -> bool:
     return box.dtype == np.uint8 and len(sides) in (2, 3) and sides[1] >= 16
 
 
-def _image_reader(name: str, key: str, box: spaces.Box) -> Callable[[Any], Array]:
+def _image_reader(name: str, key: str, box: spaces.Box) -> Callable[[object], Array]:
     """Return what makes images of any size and order of axes 84 x 84 x 3."""
     shape = box.shape if len(box.shape) == 3 else (*box.shape, 1)
     channels_first = shape[0] in (1, 3) and shape[2] not in (1, 3)
@@ -120,7 +122,7 @@ def _image_reader(name: str, key: str, box: spaces.Box) -> Callable[[Any], Array
         )
     rows, columns = (_shrinking(side, IMAGE_SIDE) for side in shape[:2])
 
-    def read(value: Any) -> Array:
+    def read(value: object) -> Array:
         image = np.asarray(value, np.uint8)
         if image.ndim == 2:
             image = image[..., None]
@@ -143,7 +145,7 @@ def _shrinking(old: int, new: int) -> Array:
     return np.asarray(covered / covered.sum(1, keepdims=True), np.float32)
 
 
-def word_of(info: Mapping[str, Any]) -> tuple[str, int]:
+def word_of(info: Options) -> tuple[str, int]:
     """Return what info says of success: its key, and 1, 0, or -1 where it says nothing."""
     for key in ("is_success", "success"):
         if key in info:

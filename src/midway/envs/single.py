@@ -1,10 +1,11 @@
 """The single environments that Gymnasium makes: batches of one."""
 
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import gymnasium
 import numpy as np
 
+from midway.envs.reading import AnySpace
 from midway.envs.registry import make_vec
 from midway.envs.vector import Array
 from midway.envs.window import Window, check_display
@@ -45,7 +46,7 @@ class SingleGoalEnv(gymnasium.Env[Observations, Array]):
         self._window: Window | None = None
         self.vector = make_vec(name, num_envs=1, task=task, num_threads=1)
         self.goal_spec = self.vector.goal_spec
-        self.observation_space: gymnasium.Space[Any] = self.vector.single_observation_space
+        self.observation_space: AnySpace = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
 
     def reset(

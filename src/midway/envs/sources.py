@@ -13,7 +13,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -21,8 +21,14 @@ import gymnasium
 
 from midway.envs import packages
 from midway.errors import ConfigurationError
+from midway.types import (
+    Function,
+    JsonObject,
+    Options,
+    OwnEnv,
+)
 
-Env: TypeAlias = Any
+Env: TypeAlias = OwnEnv
 """A Gymnasium environment of any kind of observation and action."""
 
 
@@ -45,7 +51,7 @@ class Source:
     reference: str
     kwargs: str = "{}"
     imports: tuple[str, ...] = ()
-    factory: Callable[..., Any] | None = None
+    factory: Function | None = None
 
     def make(self, max_episode_steps: int | None = None, render_mode: str | None = None) -> Env:
         """Return one new environment.
@@ -76,7 +82,7 @@ class Source:
             )
         return packages.adapted(self.reference.rpartition(":")[2], env)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return what a run folder stores.
 
         Raises:
@@ -91,15 +97,15 @@ class Source:
         return {"reference": self.reference, "kwargs": kwargs, "imports": list(self.imports)}
 
     @staticmethod
-    def from_json(stored: Mapping[str, Any]) -> "Source":
+    def from_json(stored: Options) -> "Source":
         """Return the source that ``to_json`` was taken from."""
         kwargs = json.dumps(stored["kwargs"], sort_keys=True)
         return Source(stored["reference"], kwargs, tuple(stored["imports"]))
 
 
 def source(
-    env: "str | Source | Callable[..., Any] | Env",
-    kwargs: Mapping[str, Any] | None = None,
+    env: "str | Source | Function | Env",
+    kwargs: Options | None = None,
     imports: tuple[str, ...] = (),
 ) -> Source:
     """Return where an environment comes from.
@@ -196,7 +202,7 @@ def _register(name: str) -> None:
         ) from error
 
 
-def _callable(reference: str) -> Callable[..., Any] | None:
+def _callable(reference: str) -> Function | None:
     """Return the callable that ``module:name`` names; nothing where this is no such name."""
     module, colon, name = reference.partition(":")
     if not colon or not re.fullmatch(r"[A-Za-z_][\w.]*", name):
@@ -207,14 +213,14 @@ def _callable(reference: str) -> Callable[..., Any] | None:
     return value if callable(value) else None
 
 
-def _reference(function: Callable[..., Any]) -> str:
+def _reference(function: Function) -> str:
     if isinstance(function, functools.partial):
         return f"{_reference(function.func)}(...)"
     name = getattr(function, "__qualname__", type(function).__name__)
     return f"{getattr(function, '__module__', '?')}:{name}"
 
 
-def _finds(reference: str, function: Callable[..., Any]) -> bool:
+def _finds(reference: str, function: Function) -> bool:
     """Return whether another process would find this very callable by its reference."""
     if reference.startswith("__main__:") or "<" in reference:
         return False
@@ -240,7 +246,7 @@ def _source_of_object(env: Env, imports: tuple[str, ...]) -> Source:
     )
 
 
-def _as_json(kwargs: Mapping[str, Any]) -> str:
+def _as_json(kwargs: Options) -> str:
     try:
         return json.dumps(dict(kwargs), sort_keys=True)
     except TypeError as error:

@@ -8,17 +8,24 @@ import atexit
 import functools
 import importlib
 import json
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from midway.envs.sources import Source, import_module
 from midway.errors import ConfigurationError
-from midway.types import ArrayLike, DistanceTask
+from midway.types import (
+    ArrayLike,
+    DistanceTask,
+    Function,
+    JsonObject,
+    NumPyArray,
+    Options,
+    OwnEnv,
+)
 
-Array: TypeAlias = np.ndarray[Any, np.dtype[Any]]
+Array: TypeAlias = NumPyArray
 How: TypeAlias = Literal["compiled", "batched", "pairs"]
 """How a rule is asked: inside the compiled step, once for a batch, or once for each pair."""
 
@@ -41,7 +48,7 @@ class DistanceRule(DistanceTask):
         groups = " and ".join(f"coordinates {list(group)}" for group in self.groups)
         return f"within {self.threshold:.6g} of the goal in {groups} ({self.because})"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return what a run folder stores."""
         groups = [list(group) for group in self.groups]
         values = {"groups": groups, "threshold": self.threshold, "because": self.because}
@@ -125,18 +132,18 @@ class AskedRule(HostRule):
         """Reached where the answer, as a number, is above this."""
         return 0.5 if self.above is None else self.above
 
-    def answers(self, env: Any, achieved: Array, desired: Array) -> Array:
+    def answers(self, env: OwnEnv, achieved: Array, desired: Array) -> Array:
         """Return whether an environment says that each goal is reached ``(B,)``."""
         reached: Array = self.values(env, achieved, desired) > self.threshold
         return reached
 
-    def values(self, env: Any, achieved: Array, desired: Array) -> Array:
+    def values(self, env: OwnEnv, achieved: Array, desired: Array) -> Array:
         """Return what an environment answers to each pair ``(B,)``, as float64."""
         shape = (len(achieved), *self.goal_shape)
         pairs = achieved.reshape(shape), desired.reshape(shape)
         return ask(env, self.method, *pairs, self.batched)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return what a run folder stores.
 
         Raises:
@@ -164,7 +171,7 @@ class FunctionRule(HostRule):
 
     reference: str
     asked: How
-    function: Callable[..., Any] | None = None
+    function: Function | None = None
 
     @property
     def how(self) -> How:
@@ -191,7 +198,7 @@ class FunctionRule(HostRule):
         function = self.function or function_of(self.reference)
         return function(achieved, desired).astype("bool")
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return what a run folder stores.
 
         Raises:
@@ -208,7 +215,7 @@ class FunctionRule(HostRule):
 Rule: TypeAlias = DistanceRule | AskedRule | FunctionRule
 
 
-def from_json(stored: Mapping[str, Any]) -> Rule:
+def from_json(stored: Options) -> Rule:
     """Return the rule that ``to_json`` was taken from.
 
     Raises:
@@ -232,7 +239,7 @@ def from_json(stored: Mapping[str, Any]) -> Rule:
 
 
 @functools.lru_cache(maxsize=8)
-def judge(source: Source) -> Any:
+def judge(source: Source) -> OwnEnv:
     """Return an environment that is only asked about goals, one for each process."""
     env = source.make()
     env.reset(seed=1)
@@ -243,7 +250,7 @@ def judge(source: Source) -> Any:
 atexit.register(judge.cache_clear)
 
 
-def method_of(env: Any, name: str) -> Callable[..., Any] | None:
+def method_of(env: OwnEnv, name: str) -> Function | None:
     """Return a method of an environment, of its outermost wrapper that has one."""
     for owner in (env, env.unwrapped):
         method = getattr(owner, name, None)
@@ -252,18 +259,18 @@ def method_of(env: Any, name: str) -> Callable[..., Any] | None:
     return None
 
 
-def ask(env: Any, name: str, achieved: Array, desired: Array, batched: bool) -> Array:
+def ask(env: OwnEnv, name: str, achieved: Array, desired: Array, batched: bool) -> Array:
     """Return the answers ``(B,)`` of a method to pairs of goals ``(B, ...)``, as float64."""
-    method: Any = method_of(env, name)
+    method: Function | None = method_of(env, name)
     # Public methods of the goal API are given an info, which hindsight goals do not have.
-    extra: tuple[Any, ...] = () if name.startswith("_") else ({},)
+    extra: tuple[object, ...] = () if name.startswith("_") else ({},)
     if batched:
         return np.asarray(method(achieved, desired, *extra), np.float64).reshape(len(achieved))
     pairs = zip(achieved, desired, strict=True)
     return np.array([np.asarray(method(*pair, *extra)).item() for pair in pairs], np.float64)
 
 
-def function_of(reference: str) -> Callable[..., Any]:
+def function_of(reference: str) -> Function:
     """Return the function that ``module:function`` names.
 
     Raises:
@@ -278,7 +285,7 @@ def function_of(reference: str) -> Callable[..., Any]:
     return function  # type: ignore[no-any-return]
 
 
-def reference_of(function: Callable[..., Any]) -> tuple[str, Callable[..., Any] | None]:
+def reference_of(function: Function) -> tuple[str, Function | None]:
     """Return how a function is stored, and the function itself where it cannot be."""
     name = getattr(function, "__qualname__", type(function).__name__)
     module = getattr(function, "__module__", "?")

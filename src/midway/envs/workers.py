@@ -18,6 +18,10 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from midway.envs.group import Group
 from midway.envs.reading import Array
+from midway.types import (
+    NamedValues,
+    OwnEnv,
+)
 
 Answer: TypeAlias = tuple[dict[str, Array], dict[int, str]]
 """What all environments show, and what those raised that broke."""
@@ -65,7 +69,7 @@ class Workers:
             functools.partial(make_group, first=first, size=self.size, busy=shared.name)
             for first in range(0, total, self.size)
         ]
-        self._vector: Any = None
+        self._vector: OwnEnv = None
         self._start()
 
     def _start(self) -> None:
@@ -97,7 +101,7 @@ class Workers:
         groups = np.zeros(self._vector.action_space.shape or (), np.float32)
         groups.reshape(-1, actions.shape[-1])[: self.total] = actions
 
-        def answer() -> Any:
+        def answer() -> object:
             self._vector.step_async(groups)
             return self._vector.step_wait(self.limit)
 
@@ -117,7 +121,7 @@ class Workers:
         texts = [json.loads(text) for text in answer[-1].get("raised", ()) if text]
         return shown, {int(copy): said for text in texts for copy, said in text.items()}
 
-    def _ask(self, question: Callable[[], Any]) -> Any:
+    def _ask(self, question: Callable[[], OwnEnv]) -> OwnEnv:
         """Ask all processes something.
 
         Raises:
@@ -158,7 +162,7 @@ def _close_all() -> None:
         workers.close()
 
 
-def _kill(vector: Any) -> None:
+def _kill(vector: OwnEnv) -> None:
     """End the processes of a vector environment at once."""
     vector.closed = True
     for process in vector.processes:
@@ -169,7 +173,7 @@ def _kill(vector: Any) -> None:
             pipe.close()
 
 
-def _shut(vector: Any) -> None:
+def _shut(vector: OwnEnv) -> None:
     """End the processes of a vector environment, whatever they are doing."""
     vector.closed = True
     for pipe in vector.parent_pipes:
@@ -185,7 +189,7 @@ def _without_script() -> Iterator[None]:
     """Hide the user's script from new processes, which would run it again."""
     script = sys.modules["__main__"]
     names = ("__file__", "__spec__")
-    hidden: dict[str, Any] = {name: vars(script)[name] for name in names if name in vars(script)}
+    hidden: NamedValues = {name: vars(script)[name] for name in names if name in vars(script)}
     try:
         vars(script).pop("__file__", None)
         script.__spec__ = None

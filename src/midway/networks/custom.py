@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Key
 
 from midway.errors import ConfigurationError
 from midway.networks.mlp import MLP, Precision
+from midway.types import Function
 
 
 @runtime_checkable
@@ -79,7 +80,7 @@ def create(
     return network
 
 
-def _function(name: str) -> Callable[..., Any]:
+def _function(name: str) -> Function:
     module, _, attribute = name.partition(":")
     try:
         function: Any = getattr(importlib.import_module(module), attribute)

@@ -13,7 +13,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from midway.errors import ConfigurationError
-from midway.types import NumPyArray
+from midway.types import Function, NumPyArray
 
 BATCH = "batch"
 """A side of a shape that is the size of the batch."""
@@ -40,6 +40,10 @@ REPEATED = {"scan", "while", "cond"}
 """Primitives that call another program, but not once."""
 
 
+Detail: TypeAlias = Any
+"""What an operation needs besides arrays, by its kind."""
+
+
 @dataclass(frozen=True)
 class Operation:
     """One array from others.
@@ -55,7 +59,7 @@ class Operation:
     kind: str
     inputs: tuple["str | NumPyArray", ...]
     output: str
-    detail: Any = None
+    detail: Detail = None
 
 
 @dataclass
@@ -75,14 +79,17 @@ class Program:
     output: str = ""
 
 
+Equation: TypeAlias = Any
+"""One of a jaxpr; JAX types no shapes of its variables."""
+
 Value: TypeAlias = Any
 """The name of an array that depends on the inputs, or a constant of JAX or NumPy."""
 
-Parts: TypeAlias = tuple[str, list[Value], Any]
+Parts: TypeAlias = tuple[str, list[Value], Detail]
 """Kind, inputs and detail of an operation."""
 
 
-def trace(function: Callable[..., Any], inputs: Sequence[str], sizes: Sequence[int]) -> Program:
+def trace(function: Function, inputs: Sequence[str], sizes: Sequence[int]) -> Program:
     """Return a function of arrays ``(B, n)`` as a program.
 
     Raises:
@@ -105,10 +112,10 @@ class _Tracer:
     def run(self, closed: ClosedJaxpr, arguments: list[Value]) -> list[Value]:
         """Return the values of the outputs for those of the inputs."""
         jaxpr: Jaxpr = closed.jaxpr
-        known: dict[Any, Value] = dict(zip(jaxpr.constvars, closed.consts, strict=True))
+        known: dict[object, Value] = dict(zip(jaxpr.constvars, closed.consts, strict=True))
         known |= dict(zip(jaxpr.invars, arguments, strict=True))
 
-        def value(atom: Any) -> Value:
+        def value(atom: Value) -> Value:
             return atom.val if isinstance(atom, Literal) else known[atom]
 
         for equation in jaxpr.eqns:
@@ -116,7 +123,7 @@ class _Tracer:
             known |= zip(equation.outvars, self._apply(equation, inputs), strict=True)
         return [value(atom) for atom in jaxpr.outvars]
 
-    def _apply(self, equation: Any, inputs: list[Value]) -> list[Value]:
+    def _apply(self, equation: Equation, inputs: list[Value]) -> list[Value]:
         """Return the values of an equation's outputs."""
         name, params = equation.primitive.name, equation.params
         called = [params[key] for key in CALLS if key in params]
@@ -133,7 +140,7 @@ class _Tracer:
             return inputs
         return [self._add(*parts) for parts in _operations(equation, inputs, shapes)]
 
-    def _add(self, kind: str, inputs: Sequence[Value], detail: Any = None) -> str:
+    def _add(self, kind: str, inputs: Sequence[Value], detail: Detail = None) -> str:
         """Append an operation; return the name of its result."""
         output = f"x{len(self._program.operations)}"
         given = tuple(x if isinstance(x, str) else _constant(x) for x in inputs)
@@ -141,7 +148,7 @@ class _Tracer:
         return output
 
 
-def _operations(equation: Any, inputs: list[Value], shapes: list[Shape]) -> list[Parts]:
+def _operations(equation: Equation, inputs: list[Value], shapes: list[Shape]) -> list[Parts]:
     """Return the operation for each output of an equation.
 
     Raises:
@@ -160,7 +167,7 @@ def _operations(equation: Any, inputs: list[Value], shapes: list[Shape]) -> list
     return [found]
 
 
-def _product(equation: Any, inputs: list[Value], shape: Shape) -> Parts | None:
+def _product(equation: Equation, inputs: list[Value], shape: Shape) -> Parts | None:
     """Return a product of rows ``(..., I)`` and a matrix ``(I, O)``; None for any other."""
     (left, right), batched = equation.params["dimension_numbers"]
     rank, sides = (len(variable.aval.shape) for variable in equation.invars)
@@ -168,7 +175,7 @@ def _product(equation: Any, inputs: list[Value], shape: Shape) -> Parts | None:
     return ("matmul", inputs, None) if rows else None
 
 
-def _take(equation: Any, inputs: list[Value], shape: Shape) -> Parts | None:
+def _take(equation: Equation, inputs: list[Value], shape: Shape) -> Parts | None:
     """Return a choice of known entries along one axis; None for any other gather."""
     numbers, sides = equation.params["dimension_numbers"], equation.invars[0].aval.shape
     array, entries = inputs
@@ -182,14 +189,14 @@ def _take(equation: Any, inputs: list[Value], shape: Shape) -> Parts | None:
     return "take", [array, np.asarray(entries)[:, 0]], axes[0]
 
 
-def _spread(equation: Any, inputs: list[Value], shape: Shape) -> Parts:
+def _spread(equation: Equation, inputs: list[Value], shape: Shape) -> Parts:
     """Return a broadcast: the shape with a side of 1 for each new axis, then the whole one."""
     sides = _shape(equation.invars[0].aval.shape)
     known = dict(zip(equation.params["broadcast_dimensions"], sides, strict=True))
     return "broadcast", inputs[:1], (tuple(known.get(a, 1) for a in range(len(shape))), shape)
 
 
-def _cut(equation: Any, inputs: list[Value], shape: Shape) -> Parts | None:
+def _cut(equation: Equation, inputs: list[Value], shape: Shape) -> Parts | None:
     """Return a slice along one axis; None for any other."""
     sides, params = equation.invars[0].aval.shape, equation.params
     bounds = list(zip(params["start_indices"], params["limit_indices"], sides, strict=True))
@@ -200,11 +207,11 @@ def _cut(equation: Any, inputs: list[Value], shape: Shape) -> Parts | None:
     return "slice", inputs, (cut[0], int(start), int(end))
 
 
-def _reshape(equation: Any, inputs: list[Value], shape: Shape) -> Parts:
+def _reshape(equation: Equation, inputs: list[Value], shape: Shape) -> Parts:
     return "reshape", inputs[:1], shape
 
 
-OTHERS: dict[str, Callable[[Any, list[Value], Shape], Parts | None]] = {
+OTHERS: dict[str, Callable[[Equation, list[Value], Shape], Parts | None]] = {
     "integer_pow": lambda equation, x, shape: ("power", x, equation.params["y"]),
     "convert_element_type": lambda equation, x, shape: ("float", x, None),
     "concatenate": lambda equation, x, shape: ("concatenate", x, equation.params["dimension"]),
@@ -233,7 +240,7 @@ def _shape(shape: Sequence[int]) -> Shape:
     return tuple(BATCH if side == TRACED else int(side) for side in shape)
 
 
-def _constant(value: Any) -> NumPyArray:
+def _constant(value: Value) -> NumPyArray:
     array = np.asarray(value)
     return array if array.dtype in (np.bool_, np.int64, np.int32) else array.astype(np.float32)
 

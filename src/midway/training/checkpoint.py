@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
 import numpy as np
@@ -17,7 +17,7 @@ from midway import files
 from midway.errors import ConfigurationError
 from midway.types import AnyArray, EnvSpec, JsonObject, NumPyArray
 
-Stored: TypeAlias = dict[str, Any]
+Stored: TypeAlias = JsonObject
 """Dictionaries of arrays, within each other."""
 
 KEPT = 2

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from tensorboardX.proto import event_pb2, summary_pb2
 from tensorboardX.record_writer import masked_crc32c
@@ -50,7 +50,7 @@ class Events:
             self._file.close()
             self._file = None
 
-    def _write(self, **parts: Any) -> None:
+    def _write(self, **parts: object) -> None:
         if self._file is None:
             return
         data = event_pb2.Event(wall_time=time.time(), **parts).SerializeToString()
