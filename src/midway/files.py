@@ -3,12 +3,12 @@
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from midway.errors import ConfigurationError
-from midway.types import JsonObject, Options
 
 UNFINISHED = ".new"
 """Ending of a file that is being written; it stays behind where the process is killed."""
@@ -63,12 +63,12 @@ def parsed(text: str) -> Any:
         raise ValueError("nested too deeply") from error
 
 
-def sealed(values: Options) -> JsonObject:
+def sealed(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return plain values with the checksum of them all."""
     return {**values, SEAL: _digest(values)}
 
 
-def check_seal(values: Options, name: str | Path) -> None:
+def check_seal(values: Mapping[str, Any], name: str | Path) -> None:
     """Check that values are as `sealed` left them; those without a checksum pass.
 
     Raises:
@@ -86,6 +86,6 @@ def short(digest: object) -> str:
     return str(digest)[:12]
 
 
-def _digest(values: Options) -> str:
+def _digest(values: Mapping[str, Any]) -> str:
     rest = {name: value for name, value in values.items() if name != SEAL}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()

@@ -90,7 +90,7 @@ def hidden() -> Any:
 
 def test_an_exported_policy_takes_and_gives_what_the_environment_does(tmp_path: Path) -> None:
     foreign = describe(hidden)
-    config = configure(foreign, "sac", changes={"hidden": (8,)})
+    config = configure(foreign, "sac", changes={"hidden": (8,), "precision": "f32"})
     agent = registry.get("sac")
     state = create_state(agent, config.hyperparameters, foreign.spec, jax.random.key(0))
     policy = Policy(agent, state, config, foreign.spec)
