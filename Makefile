@@ -45,7 +45,7 @@ test: lint
 	$(PYTEST) --cov=midway -m "not extra and not docs and not release"
 	$(BIN)/coverage report --include='$(CAREFUL)' --fail-under=95
 
-# Everything. Coverage is left out: its tracer takes a tenth of the time. Chromium and Xvfb are
+# Everything. Coverage is left out: its tracer slows every test. Chromium and Xvfb are
 # Debian's: .ci/run installs them.
 test-all: $(VENV)/installed-extras lint
 	$(PYTEST) -m "not docs and not release"
