@@ -1,10 +1,9 @@
-"""See what writing checkpoints leaves in memory, and how much of that TensorStore's counters are.
+"""See what writing checkpoints leaves in memory.
 
     python benchmarks/checkpoint_memory.py
 
-Writes the same small state again and again, as a run does, then asks TensorStore for its counters
-as Orbax does for each checkpoint. Prints kilobytes that stay for each, and writes them to
-``benchmarks/results/soak/checkpoints.json``.
+Writes the same small state again and again, as a run does. Prints the kilobytes that stay for
+each, and writes them to ``benchmarks/results/soak/checkpoints.json``.
 """
 
 import ctypes
@@ -12,11 +11,9 @@ import gc
 import json
 import resource
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import jax.numpy as jnp
-import tensorstore
 
 from midway.training.checkpoint import Checkpoints
 
@@ -29,30 +26,19 @@ FIRST, COUNTED = 100, 300
 
 
 def main() -> None:
-    """Measure both."""
+    """Measure it."""
     state = {str(number): jnp.ones((64, 64)) for number in range(ARRAYS)}
     with tempfile.TemporaryDirectory() as folder:
         checkpoints = Checkpoints(Path(folder))
-        kept = {
-            "arrays": ARRAYS,
-            "repetitions": COUNTED,
-            "kilobytes_of_a_checkpoint": growth(lambda step: checkpoints.save(step, state)),
-            "kilobytes_of_asking_for_counters": growth(
-                lambda step: tensorstore.experimental_collect_matching_metrics("/tensorstore/")
-            ),
-        }
+        for step in range(FIRST):
+            checkpoints.save(step, state)
+        before = resident()
+        for step in range(FIRST, FIRST + COUNTED):
+            checkpoints.save(step, state)
+        grown = round((resident() - before) / COUNTED / 1e3, 1)
+    kept = {"arrays": ARRAYS, "repetitions": COUNTED, "kilobytes_of_a_checkpoint": grown}
     FILE.write_text(json.dumps(kept, indent=2) + "\n")
     print(json.dumps(kept, indent=2))
-
-
-def growth(repeated: Callable[[int], object]) -> float:
-    """Return the kilobytes that each repetition leaves in memory."""
-    for step in range(FIRST):
-        repeated(step)
-    before = resident()
-    for step in range(FIRST, FIRST + COUNTED):
-        repeated(step)
-    return round((resident() - before) / COUNTED / 1e3, 1)
 
 
 def resident() -> int:

@@ -28,7 +28,7 @@ BF16 = ("--precision", "bf16")
 ROBOTICS = {
     "PandaReach-v3": 20_000,
     "PointMaze_UMaze-v3": 32_000,
-    "PointMaze_Medium-v3": 64_000,
+    "PointMaze_Medium-v3": 128_000,
     "FetchReach-v4": 12_000,
     "FetchPush-v4": 180_000,
     "PandaPush-v3": 120_000,

@@ -206,7 +206,7 @@ def use_maze(path: Path, seldom: bool) -> None:
 
 def one_of_many(folder: Path) -> Mutate:
     """Return what changes one file of a checkpoint, and now and then its manifest to fit."""
-    files_of = sorted(path for path in (folder / "default").rglob("*") if path.is_file())
+    files_of = sorted(path for path in folder.rglob("*") if path.name != MANIFEST)
     whole = {path: path.read_bytes() for path in files_of}
 
     def change(chance: random.Random, manifest: bytes) -> bytes:

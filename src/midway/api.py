@@ -261,7 +261,7 @@ def _run_locked(
     say: Reporter = reporter(config.train.steps, number or 0) if progress else Silent()
     watchers = Watchers(config, folder, callbacks)
     try:
-        with signals.listening() as asked, closing(say), closing(checkpoints):
+        with signals.listening() as asked, closing(say):
             try:
                 parts = checkpoints, say, watchers
                 finished = _run(config, folder, setup, parts, number, asked)

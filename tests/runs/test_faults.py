@@ -88,6 +88,7 @@ def test_a_full_disk_ends_the_run_with_its_reason_and_it_goes_on_with_room(
     ended = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
     assert ended.returncode == 1
     assert "No space left" in ended.stderr.splitlines()[-1]
+    assert "Traceback" not in ended.stderr
     subprocess.run(["mount", "-o", "remount,size=20m", small_disk], check=True)
     assert midway.resume(run).finished
     assert_same_run(whole, run)

@@ -158,7 +158,6 @@ def test_exact_resume_before_freezing(tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path / "checkpoints")
     checkpoints.save(stop, state.state_dict(whole))
     resumed = state.restore(build(tmp_path / "resumed"), checkpoints, stop)
-    checkpoints.close()
     assert resumed.encoder is whole.encoder is None
     for training in (whole, resumed):
         advance(training, 14)

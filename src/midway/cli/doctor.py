@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from midway.errors import needing
 
-LIBRARIES = ("jax", "equinox", "optax", "mujoco", "gymnasium", "orbax-checkpoint")
+LIBRARIES = ("jax", "equinox", "optax", "mujoco", "gymnasium")
 
 
 @dataclass(frozen=True)

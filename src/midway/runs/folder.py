@@ -327,9 +327,7 @@ class RunFolder:
 
     def owner(self, config: RunConfig) -> Owner:
         """Return whose the checkpoints of the run must be."""
-        written = read_json(self.config_file).get("format", FORMAT)
-        sealed = written >= SEALED_SINCE
-        return Owner(self.identity(config), config.env, config.agent, sealed)
+        return Owner(self.identity(config), config.env, config.agent)
 
     def load_config(self) -> RunConfig:
         """Return the configuration of the run.

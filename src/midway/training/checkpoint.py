@@ -1,32 +1,26 @@
 """Whole states on disk: written completely or not at all, and checked before they are used."""
 
 import json
-import logging
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TypeAlias
-
-import jax
-import numpy as np
-import orbax.checkpoint as ocp
 
 from midway import files
 from midway.errors import ConfigurationError
-from midway.types import AnyArray, EnvSpec, JsonObject, NumPyArray
-
-Stored: TypeAlias = JsonObject
-"""Dictionaries of arrays, within each other."""
+from midway.training import archive
+from midway.training.archive import Stored
+from midway.types import EnvSpec, JsonObject
 
 KEPT = 2
 """Checkpoints kept: the newest, and the one before it should the newest be damaged."""
 
-FORMAT = 1
+FORMAT = 2
 """Counted up when the files of a checkpoint change."""
 
-ARRAYS = "default"
+STATE = "state.npz"
+EARLIER = "default"
+"""Folder of the arrays in checkpoints of format 1."""
+
 MANIFEST = "manifest.json"
 SET_ASIDE = ".set-aside"
 
@@ -39,13 +33,11 @@ class Owner:
         run: Its identity.
         env: Environment name.
         agent: Agent name.
-        sealed: Whether each checkpoint must have checksums: those of earlier versions have none.
     """
 
     run: str
     env: str
     agent: str
-    sealed: bool = True
 
 
 class Checkpoints:
@@ -64,7 +56,6 @@ class Checkpoints:
     def __init__(self, folder: Path, owner: Owner | None = None) -> None:
         self._folder = folder.absolute()
         self._owner = owner
-        self._checkpointer = ocp.Checkpointer(ocp.StandardCheckpointHandler())
 
     def steps(self) -> list[int]:
         """Return the steps of all checkpoints, the newest last."""
@@ -93,9 +84,9 @@ class Checkpoints:
         try:
             self.remove_unfinished()
             self._folder.mkdir(exist_ok=True)
-            with _quiet(logging.CRITICAL):  # its threads print what is raised here too
-                self._checkpointer.save(unfinished / ARRAYS, args=ocp.args.StandardSave(state))
-            self._seal(unfinished, step, spec)
+            unfinished.mkdir()
+            archive.write(unfinished / STATE, state)
+            self._seal(unfinished, step, state, spec)
             unfinished.rename(self._folder / str(step))
             for old in self.steps()[:-KEPT]:
                 _remove(self._folder / str(old))
@@ -120,12 +111,13 @@ class Checkpoints:
                 name = name.with_name(f"{later}{SET_ASIDE}-{number}")
             (self._folder / str(later)).rename(name)
 
-    def _seal(self, folder: Path, step: int, spec: EnvSpec | None) -> None:
+    def _seal(self, folder: Path, step: int, state: Stored, spec: EnvSpec | None) -> None:
         manifest = {
             "format": FORMAT,
             "step": step,
             "owner": asdict(self._owner) if self._owner else None,
             "spec": spec.to_json() if spec else None,
+            "parts": sorted(state),
             "files": {name: files.checksum(folder / name) for name in _names(folder)},
         }
         files.write(folder / MANIFEST, json.dumps(files.sealed(manifest), indent=1).encode())
@@ -167,9 +159,12 @@ class Checkpoints:
         folder, name = self._folder / str(step), f"checkpoint of step {step}"
         if not folder.is_dir():
             raise ConfigurationError(f"{name} is not there: {self._folder / str(step)}")
+        if (folder / EARLIER).is_dir():
+            raise ConfigurationError(
+                f"{name} was written by an earlier version of midway, which can go on from it; "
+                "this one cannot"
+            )
         manifest = self._manifest(step)
-        if manifest is None:
-            return
         try:
             if (manifest["format"], manifest["step"]) != (FORMAT, step):
                 raise ConfigurationError(
@@ -189,7 +184,7 @@ class Checkpoints:
         Raises:
             ConfigurationError: It is not; the text names the first difference.
         """
-        stored = (self._manifest(step) or {}).get("spec") or {}
+        stored = self._manifest(step).get("spec") or {}
         now = json.loads(json.dumps(spec.to_json()))
         for name in stored.keys() & now.keys():
             if stored[name] != now[name]:
@@ -198,9 +193,9 @@ class Checkpoints:
                     f"{stored[name]}, expected {now[name]}"
                 )
 
-    def parts(self, step: int) -> tuple[str, ...]:
-        """Return the names of what a checkpoint holds; nothing if it cannot be read."""
-        return tuple(self._metadata(step))
+    def parts(self, step: int) -> set[str]:
+        """Return the names of what a checkpoint holds."""
+        return set(self._manifest(step)["parts"])
 
     def restore(self, step: int, like: Stored) -> Stored:
         """Return the state of a step, with the structure, shapes and dtypes of ``like``.
@@ -210,21 +205,9 @@ class Checkpoints:
         """
         self.verify(step)
         try:
-            target = jax.tree.map(_abstract, self._stored(step, like))
-            with _quiet():
-                restored: Stored = self._checkpointer.restore(
-                    self._folder / str(step) / ARRAYS, args=ocp.args.StandardRestore(target)
-                )
-            return restored
-        except Exception as error:  # whatever Orbax makes of arrays that somebody else wrote
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise ConfigurationError(
-                f"checkpoint of step {step} cannot be read: {reason}"
-            ) from error
-
-    def close(self) -> None:
-        """Free what reading and writing hold."""
-        self._checkpointer.close()
+            return archive.read(self._folder / str(step) / STATE, like)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"checkpoint of step {step}: {error}") from error
 
     def _whole(self, step: int) -> bool:
         try:
@@ -233,11 +216,9 @@ class Checkpoints:
             return False
         return True
 
-    def _manifest(self, step: int) -> JsonObject | None:
-        """Return what a checkpoint says of itself; None for one of an earlier version."""
+    def _manifest(self, step: int) -> JsonObject:
+        """Return what a checkpoint says of itself."""
         path = self._folder / str(step) / MANIFEST
-        if not path.exists() and not (self._owner and self._owner.sealed):
-            return None
         try:
             manifest = files.parsed(path.read_text())
         except (OSError, ValueError) as error:
@@ -261,35 +242,12 @@ class Checkpoints:
                     f"{name} is of another run: {what} {found!r}, expected {expected[what]!r}"
                 )
 
-    def _metadata(self, step: int) -> Stored:
-        try:
-            with _quiet():
-                found = self._checkpointer.metadata(self._folder / str(step) / ARRAYS)
-            return dict(found.item_metadata or {})
-        except Exception:  # as above; restoring says what is wrong
-            return {}
-
-    def _stored(self, step: int, like: Stored) -> Stored:
-        """Return ``like`` without what checkpoints of earlier versions do not have."""
-        there = self._metadata(step)
-        parts = {name: _common(like[name], there.get(name, {})) for name in ("collector", "replay")}
-        return {**like, **parts}
-
 
 def steps_in(folder: Path) -> list[int]:
     """Return the steps of the checkpoints in a folder, the newest last."""
     if not folder.is_dir():
         return []
     return sorted(int(path.name) for path in folder.iterdir() if path.name.isdecimal())
-
-
-def _common(like: Stored, there: Stored) -> Stored:
-    """Return what is in both, from the first."""
-    return {
-        name: _common(part, there[name]) if isinstance(part, dict) else part
-        for name, part in like.items()
-        if name in there
-    }
 
 
 def _names(folder: Path) -> list[str]:
@@ -326,22 +284,3 @@ def _remove(folder: Path) -> None:
     """Remove a checkpoint under another name, so that no half of one is called by its step."""
     going = folder.rename(folder.with_name(f"{folder.name}{files.UNFINISHED}"))
     shutil.rmtree(going)
-
-
-@contextmanager
-def _quiet(least: int = logging.ERROR) -> Iterator[None]:
-    """Keep Orbax from warning of metadata that earlier versions did not write, and the like."""
-    logger = logging.getLogger("absl")
-    level = logger.level
-    logger.setLevel(least)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
-
-
-def _abstract(leaf: AnyArray) -> jax.ShapeDtypeStruct | NumPyArray:
-    """Describe an array: NumPy arrays come back as NumPy arrays, others on their devices."""
-    if isinstance(leaf, jax.Array):
-        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
-    return np.empty(leaf.shape, leaf.dtype)

@@ -10,7 +10,7 @@ import numpy as np
 from midway.errors import BrokenEnvironmentError, ConfigurationError
 from midway.replay.storage import ReplayState
 from midway.training import faults, step
-from midway.training.checkpoint import Stored
+from midway.training.archive import Stored
 from midway.types import Info, NumPyArray, Observations, Step, VectorGoalEnv
 
 Actions = Callable[[Observations], NumPyArray]
@@ -186,7 +186,7 @@ class Collector:
     def state_dict(self) -> Stored:
         """Return simulators, observations and counts as arrays."""
         return {
-            **({"logged": {k: v.copy() for k, v in self.logged.items()}} if self.logged else {}),
+            "logged": {name: value.copy() for name, value in self.logged.items()},
             "env": self.env.state_dict(),
             "observation": dict(self.observation),
             "counts": {name: np.array(value) for name, value in vars(self.counts).items()},
@@ -210,7 +210,7 @@ class Collector:
                 f"the checkpoint does not fit the environment: {error}"
             ) from error
         counts = EpisodeCounts(**{name: int(value) for name, value in state["counts"].items()})
-        logged = {name: np.array(value) for name, value in state.get("logged", {}).items()}
+        logged = {name: np.array(value) for name, value in state["logged"].items()}
         everyone = np.ones(env.num_envs, np.bool_)
         if env.resumable:
             return Collector(

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from midway.agent import AgentState, AnyAgent, Encoder, Memory
@@ -16,8 +15,9 @@ from midway.errors import ConfigurationError
 from midway.replay import buffer
 from midway.replay.storage import ReplayState
 from midway.training import acting, demonstrations, freeze, memory, pretrain, seeds, step
+from midway.training.archive import Stored
 from midway.training.arrays import named_arrays, with_named_arrays
-from midway.training.checkpoint import Checkpoints, Stored
+from midway.training.checkpoint import Checkpoints
 from midway.training.collect import Collector
 from midway.training.config import RESTART, TrainConfig
 from midway.training.devices import Devices
@@ -327,10 +327,7 @@ def load_state_dict(training: Training, state: Stored) -> None:
     training.arrays = with_named_arrays(training.arrays, state["agent"])
     training.memory = with_named_arrays(training.memory, state.get("memory", {}))
     training.totals = state["totals"]
-    stored = state["replay"]
-    if "written" not in stored:  # in an earlier version, where nothing was withdrawn
-        stored = {**stored, "written": jnp.copy(stored["num_rows"])}
-    replay = with_named_arrays(training.replay, stored)
+    replay = with_named_arrays(training.replay, state["replay"])
     training.collector, training.replay = Collector.restore(
         training.collector.env, replay, state["collector"]
     )
