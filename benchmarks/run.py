@@ -28,10 +28,10 @@ BF16 = ("--precision", "bf16")
 ROBOTICS = {
     "PandaReach-v3": 20_000,
     "PointMaze_UMaze-v3": 32_000,
-    "PointMaze_Medium-v3": 128_000,
+    "PointMaze_Medium-v3": 96_000,
     "FetchReach-v4": 12_000,
     "FetchPush-v4": 180_000,
-    "PandaPush-v3": 120_000,
+    "PandaPush-v3": 60_000,
 }
 """Environment steps on the environments of others; 50 episodes an evaluation take their time."""
 WITHOUT = {

@@ -1,5 +1,6 @@
 """A sweep on a local Ray cluster whose driver, a worker and a node are killed one by one."""
 
+import json
 import os
 import signal
 import subprocess
@@ -7,18 +8,22 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import tiny
 from midway import tables
 from midway.cluster import sweep
 from midway.configuration import configure
 from midway.errors import ConfigurationError
+from midway.runs import complete
 from midway.runs.folder import RunFolder, write_json
 from midway.training.arrays import save_arrays
+from midway.training.checkpoint import steps_in
 
 pytestmark = [
     pytest.mark.extra,
@@ -77,17 +82,24 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.fixture
-def cluster(home: Path) -> Iterator[Any]:
-    """A head with one processor."""
+@contextmanager
+def started(processors: int) -> Iterator[Any]:
+    """Start a cluster of a head with so many processors."""
     import ray
     from ray.cluster_utils import Cluster
 
-    head = {"num_cpus": 1, "include_dashboard": False, "_system_config": SETTINGS}
-    started = Cluster(initialize_head=True, head_node_args=head)
-    yield started
+    head = {"num_cpus": processors, "include_dashboard": False, "_system_config": SETTINGS}
+    cluster = Cluster(initialize_head=True, head_node_args=head)
+    yield cluster
     ray.shutdown()
-    started.shutdown()
+    cluster.shutdown()
+
+
+@pytest.fixture
+def cluster(home: Path) -> Iterator[Any]:
+    """A head with one processor, whose runs are stand-ins."""
+    with started(1) as cluster:
+        yield cluster
 
 
 def wait_for(condition: Callable[[], Any]) -> None:
@@ -154,6 +166,46 @@ def test_a_sweep_outlives_its_driver_a_worker_and_a_node(cluster: Any, home: Pat
     for each in (0, 1):
         commands = [command for command, _ in starts(home, each)]
         assert commands == ["train"] + ["resume"] * (len(commands) - 1)
+
+
+def test_a_run_whose_worker_and_node_are_killed_ends_with_the_same_weights(tmp_path: Path) -> None:
+    changes = tiny.TINY | {"steps": 12_000, "evaluate_every": 12_000, "checkpoint_every": 400}
+    settings = [f"{name}={value}" for name, value in changes.items()]
+    job = sweep.jobs(["point-u"], ["sac"], [0], ["--set", *settings])[0]
+    run = RunFolder(tmp_path / "killed" / job.name)
+    with started(0) as cluster:
+        node = cluster.add_node(num_cpus=1)
+        states: list[sweep.Status] = []
+        address = cluster.address
+
+        def train(out: Path) -> None:
+            states.extend(sweep.run([job], out, lambda found: None, ray_address=address))
+
+        killed = threading.Thread(target=train, args=(tmp_path / "killed",), daemon=True)
+        killed.start()
+        first = after_a_checkpoint(run)
+        os.kill(parent(first), signal.SIGKILL)
+        wait_for(lambda: not is_running(first))
+        second = after_a_checkpoint(run)
+        cluster.add_node(num_cpus=1)
+        cluster.remove_node(node, allow_graceful=False)
+        wait_for(lambda: not is_running(second))
+        assert not complete.is_evaluated(run, 12_000)
+        killed.join()
+        train(tmp_path / "whole")
+    assert [status.state for status in states] == ["finished", "finished"]
+    whole = RunFolder(tmp_path / "whole" / job.name)
+    for name in ("policy_weights", "policy_config"):
+        assert getattr(run, name).read_bytes() == getattr(whole, name).read_bytes()
+    rewards = [tables.read(folder.metrics_file)["critic/loss"] for folder in (run, whole)]
+    np.testing.assert_array_equal(*rewards)
+
+
+def after_a_checkpoint(run: RunFolder) -> int:
+    """Wait until a process that trains a run has written a checkpoint; return the process."""
+    before = set(steps_in(run.checkpoints))
+    wait_for(lambda: set(steps_in(run.checkpoints)) - before)
+    return int(json.loads(run.lock_file.read_text())["pid"])
 
 
 def test_a_cluster_that_is_not_there_is_one_clear_line(tmp_path: Path) -> None:
