@@ -2,7 +2,7 @@
 
     python benchmarks/summary.py benchmarks/results/point-mazes
 
-Success is that of the last evaluation: one seed, or the interquartile mean of several, with the
+Success is that of the last evaluation of each seed: one seed, or the interquartile mean of several, with the
 95 % interval, which counts episodes and seeds (``midway.statistics``). Steps and minutes of
 training until an evaluation of the hard task (uniform, where there is none) first reached 95 %
 with the deterministic policy are those of the slowest seed.
@@ -44,8 +44,9 @@ def main() -> None:
     print("| " + " | ".join(titles) + " |")
     print("| --- " * len(titles) + "|")
     for (env, agent, precision), runs in groups.items():
-        steps = max(int(rows[-1]["step"]) for rows in runs)
-        cells = [env, agent, precision, str(len(runs)), f"{steps:,}"]
+        steps = sorted({int(rows[-1]["step"]) for rows in runs})
+        ends = " to ".join(f"{step:,}" for step in dict.fromkeys((steps[0], steps[-1])))
+        cells = [env, agent, precision, str(len(runs)), ends]
         cells += [success(runs, *column) for column in columns]
         print("| " + " | ".join([*cells, *reached(runs, shown)]) + " |")
 
