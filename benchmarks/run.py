@@ -22,6 +22,7 @@ RESULTS = Path(__file__).parent / "results"
 KEPT = ("evaluation.csv", "metrics.csv", "config.json")
 
 POINT_MAZES = ("point-u", "point-s", "point-pi", "point-omega")
+LONG_WAYS = ("ant-s", "ant-pi", "ant-omega")
 SEEDS = range(5)
 F32 = ("--precision", "f32")
 BF16 = ("--precision", "bf16")
@@ -61,6 +62,17 @@ SUITES: dict[str, list[Job]] = {
     "ant-u-fast": [
         *(Job("ant-u", "ris", seed) for seed in range(3)),
         Job("ant-u", "sac", 0),
+    ],
+    "ant-mazes": [
+        *(Job(env, "ris", seed) for env in LONG_WAYS for seed in range(3)),
+        *(Job(env, agent, 0) for env in LONG_WAYS for agent in ("sac", "leap")),
+        *(Job("ant-u", agent, 0) for agent in ("leap", "tdm")),
+    ],
+    "arm": [
+        *(Job("push", "ris", seed) for seed in range(3)),
+        *(Job("push", agent, 0) for agent in ("sac", "leap")),
+        *(Job("push-state", agent, seed) for agent in ("ris", "sac") for seed in range(3)),
+        Job("push-state", "leap", 0),
     ],
     "ant-u-ablations": [
         Job("ant-u", "ris", 0, ("--set", "steps=128000", *settings), f"without-{name}")
