@@ -2,9 +2,9 @@
 
     python benchmarks/summary.py benchmarks/results/point-mazes
 
-Success is that of the last evaluation of each seed: one seed, or the interquartile mean of several, with the
-95 % interval, which counts episodes and seeds (``midway.statistics``). Steps and minutes of
-training until an evaluation of the hard task (uniform, where there is none) first reached 95 %
+Success is that of the last evaluation of each seed: of one, or the interquartile mean of several,
+with the 95 % interval, which counts episodes and seeds (``midway.statistics``). Steps and minutes
+of training until an evaluation of the hard task (uniform, where there is none) first reached 95 %
 with the deterministic policy are those of the slowest seed.
 """
 
