@@ -10,11 +10,11 @@ import pytest
 
 import midway
 import tiny
-from midway import files
+from midway import api, files
 from midway.envs import registry
 from midway.envs.push import IMAGE_SPEC, STATE_SPEC
 from midway.errors import ConfigurationError
-from midway.runs.folder import FORMAT, RunFolder
+from midway.runs.folder import FORMAT, RunConfig, RunFolder
 from midway.types import EnvSpec, UnknownTask
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
@@ -118,6 +118,13 @@ def test_runs_with_a_setting_that_is_gone_are_read_but_not_continued(tmp_path: P
         midway.resume(run.path, steps=120)
     begun_with(False)
     assert midway.resume(run.path, steps=120).finished
+
+
+@pytest.mark.parametrize("part", ["train", "hyperparameters"])
+def test_nonsense_in_an_earlier_format_is_refused(part: str) -> None:
+    values = {**api.configure("point-u", "sac").to_json(), "format": 1, part: "[60000, 60000]"}
+    with pytest.raises(ConfigurationError, match="not understood"):
+        RunConfig.from_json(values)
 
 
 def test_there_are_configurations_of_format_1() -> None:

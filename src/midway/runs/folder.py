@@ -135,7 +135,7 @@ def _of_this_format(values: JsonObject) -> JsonObject:
     written = values.get("format", FORMAT)
     if written >= FORMAT:
         return values
-    train, agent = dict(values["train"]), dict(values["hyperparameters"])
+    train, agent = {**values["train"]}, {**values["hyperparameters"]}
     agent = {name: value for name, value in agent.items() if name not in GONE}
     if written == 1:
         train["freeze_encoder_after"] = agent.pop("encoder_updates", 0)
