@@ -186,6 +186,7 @@ def use_checkpoint(found: Checkpoints, spec: EnvSpec) -> None:
     step = found.choose()
     if step is not None:
         found.check_spec(step, spec)
+        found.parts(step)
         found.restore(step, stored())
 
 

@@ -173,6 +173,8 @@ class Checkpoints:
                 )
             if not isinstance(manifest["spec"], dict | None):
                 raise TypeError(f"spec {manifest['spec']!r}")
+            if not all(isinstance(part, str) for part in manifest["parts"]):
+                raise TypeError(f"parts {manifest['parts']!r}")
             self._check_owner(name, manifest["owner"])
             _check_files(name, folder, manifest["files"])
         except (KeyError, TypeError, AttributeError) as error:
