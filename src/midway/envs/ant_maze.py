@@ -83,7 +83,7 @@ def ant_model(maze: Maze) -> mujoco.MjModel:
         maze, inner='contype="3" conaffinity="3"', outer='contype="2" conaffinity="3"'
     )
     return mujoco.MjModel.from_xml_string(f"""
-    <mujoco model="ant-{maze.name}">
+    <mujoco model="ant">
       <compiler angle="degree" inertiafromgeom="true"/>
       <option timestep="{TIMESTEP}" integrator="RK4"/>
       <default>

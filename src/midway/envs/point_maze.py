@@ -32,7 +32,7 @@ def point_model(maze: Maze) -> mujoco.MjModel:
         servos += f'<velocity joint="{name}" kv="{1 / RESPONSE_SECONDS}"/>'
     # The contacts are as stiff as the timestep allows: the time constant is at least two of them.
     return mujoco.MjModel.from_xml_string(f"""
-    <mujoco model="point-{maze.name}">
+    <mujoco model="point">
       <option timestep="{timestep}" gravity="0 0 0"/>
       <default>
         <geom condim="1" solref="{2 * timestep} 1"/>

@@ -11,6 +11,8 @@ from midway.replay.storage import num_bytes
 GROUP = Path("/sys/fs/cgroup")
 SYSTEM = Path("/proc/meminfo")
 GB = 1e9
+ABSURD = 10**300
+"""Bytes beyond which there is no floating-point number to print."""
 GROUP_FILES = (
     ("memory.max", "memory.current", "memory.stat", "inactive_file"),
     (
@@ -43,11 +45,15 @@ def check(parts: dict[str, int]) -> None:
     needed, free = sum(parts.values()), available()
     if free is None or needed <= free or jax.default_backend() != "cpu":
         return
-    listed = ", ".join(f"{name} {size / GB:.3g} GB" for name, size in parts.items())
+    listed = ", ".join(f"{name} {_gigabytes(size)}" for name, size in parts.items())
     raise ConfigurationError(
-        f"the run needs at least {needed / GB:.3g} GB of memory ({listed}), and "
-        f"{free / GB:.3g} GB are available"
+        f"the run needs at least {_gigabytes(needed)} of memory ({listed}), and "
+        f"{_gigabytes(free)} are available"
     )
+
+
+def _gigabytes(size: int) -> str:
+    return f"{min(size, ABSURD) / GB:.3g} GB"
 
 
 def of_state(state: object) -> int:
