@@ -33,7 +33,7 @@ def write(path: Path, state: Stored) -> None:
         with zipfile.ZipFile(file, "w") as archive:
             for name, array in _entries(state).items():
                 about = zipfile.ZipInfo(name)
-                if array.dtype == np.uint8:  # images, which take a twentieth of the room then
+                if array.dtype == np.uint8:  # images: most of them is background
                     about.compress_type = zipfile.ZIP_DEFLATED
                 with archive.open(about, "w", force_zip64=True) as entry:
                     np.lib.format.write_array(entry, np.asarray(array), allow_pickle=False)
