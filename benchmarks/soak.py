@@ -4,7 +4,7 @@
     python benchmarks/soak.py --read CSV...
 
 The first command trains both with small replays, which are full within minutes, with many
-evaluations and checkpoints, and ends them by SIGTERM. It appends to one CSV file for each run as it
+evaluations and checkpoints, and ends them by SIGTERM. It writes one CSV file for each run as it
 goes. The second prints, for what a run's processes hold together, the level after the warm-up and
 the slope per hour (Theil-Sen) with its 95% interval. Needs `psutil`.
 """
@@ -57,6 +57,8 @@ def soak(folder: Path, seconds: float, every: float, results: Path) -> None:
     """
     folder.mkdir(parents=True)
     results.mkdir(parents=True, exist_ok=True)
+    for env in RUNS:  # the rows of an earlier soak
+        (results / f"{env}.csv").unlink(missing_ok=True)
     files = {env: tables.Appender(results / f"{env}.csv", until=-1) for env in RUNS}
     started = time.monotonic()
     running = {env: start(env, folder) for env in RUNS}

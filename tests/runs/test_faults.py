@@ -24,7 +24,7 @@ from midway.errors import BrokenEnvironmentError, NonFiniteObservationError
 from midway.replay.buffer import num_transitions
 from midway.runs import complete
 from midway.runs.folder import RunFolder
-from midway.training import loop, signals, state
+from midway.training import loop, signals
 from midway.training.checkpoint import steps_in
 from midway.training.collect import Collector
 from midway.training.events import Events
@@ -166,25 +166,6 @@ def test_signals_end_a_run_with_a_checkpoint_and_their_status(
     assert max(steps_in(run / "checkpoints")) == 72
     assert midway.resume(run).finished
     assert_same_run(whole, run)
-
-
-def test_a_checkpoint_from_before_episodes_were_withdrawn_goes_on(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stored = state.state_dict
-
-    def without_written(training: Training) -> Any:
-        everything = stored(training)
-        del everything["replay"]["written"]
-        return everything
-
-    with monkeypatch.context() as patch:
-        patch.setattr(state, "state_dict", without_written)
-        signal_at(patch, "advance", signal.SIGTERM, lambda t: t.counters.steps == 68)
-        run = train(tmp_path / "run")
-    assert not run.finished
-    assert midway.resume(run.path).finished
-    assert_same_run(whole, run.path)
 
 
 def test_a_step_that_does_not_return_ends_the_run_all_the_same(

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 import tiny
 from midway import api
@@ -61,17 +60,6 @@ def test_flips_are_a_column_of_ants_and_of_nothing_else(
         assert len(rows) == 2
     assert columns["ant-u"] - columns["point-u"] == {"collect/flip_rate"}
     assert 0 <= float(read(tmp_path / "ant-u").metrics["collect/flip_rate"][-1]) < 0.5
-
-
-def test_checkpoints_from_before_flips_were_counted_can_be_continued(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_episodes: None
-) -> None:
-    env_class = type(make_vec("ant-u"))
-    with monkeypatch.context() as before:
-        before.setattr(env_class, "logged_info", {})
-        api.train("ant-u", agent="sac", steps=80, out=tmp_path / "old", changes=TINY)
-    assert api.resume(tmp_path / "old", steps=120).finished
-    assert read(tmp_path / "old").steps == 120
 
 
 def test_hand_and_puck_are_evaluated_each(tmp_path: Path) -> None:
