@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
-from jaxtyping import Array, Bool, Float, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
 from midway.types import (
     AnyArray,
@@ -68,6 +68,18 @@ class Value(Generic[StateT]):
     unit: str
 
 
+class Plan(NamedTuple):
+    """Subgoals that episodes follow.
+
+    Attributes:
+        subgoals: As achieved goals in the environment's units.
+        due: Which of them is aimed at; the last one when the goal itself is.
+    """
+
+    subgoals: Float[AnyArray, "B N G"]
+    due: Int[AnyArray, " B"]
+
+
 @dataclass(frozen=True)
 class EpisodeMemory(Generic[ConfigT, StateT]):
     """What an agent carries from one step of an episode to the next.
@@ -77,8 +89,8 @@ class EpisodeMemory(Generic[ConfigT, StateT]):
         act: ``(state, memory, observation, goal, key, explore) -> (actions, memory)``.
         rest: ``(memory, done) -> memory`` where the episodes of a mask are over, so that nothing
             is computed for them; None where a step costs the same anyway.
-        plan: ``(state, memory) -> subgoals (B, N, G)`` that the episodes follow, as achieved
-            goals in the environment's units; None for an agent that plans none.
+        plan: ``(state, memory) -> Plan`` that the last action followed; None for an agent that
+            plans nothing.
         adapt: ``(config, memory, ways) -> memory`` before the first step, where it is known how
             far the goals are: ``ways (B,)`` are shares of the environment's longest way. None for
             an agent that needs not know.
@@ -89,7 +101,7 @@ class EpisodeMemory(Generic[ConfigT, StateT]):
         [StateT, Memory, Inputs, Inputs, Key[Array, ""], bool], tuple[Float[Array, "B A"], Memory]
     ]
     rest: Callable[[Memory, Bool[AnyArray, " B"]], Memory] | None = None
-    plan: Callable[[StateT, Memory], Float[Array, "B N G"]] | None = None
+    plan: Callable[[StateT, Memory], Plan] | None = None
     adapt: Callable[[ConfigT, Memory, Float[AnyArray, " B"]], Memory] | None = None
 
 

@@ -242,8 +242,19 @@ def test_an_episode_with_fewer_subgoals_aims_at_its_goal_earlier(monkeypatch):
     assert left.T.tolist() == 2 * [[2, 1, 0, 2, 1, 0, 2, 1]]
     # What is drawn of a plan holds no subgoal that was left out.
     memory = memory._replace(latents=jnp.arange(12.0).reshape(2, 3, 2))
-    shown = leap.AGENT.memory.plan(state, memory)[:, :, 0]
+    shown = leap.AGENT.memory.plan(state, memory).subgoals[:, :, 0]
     assert shown.tolist() == [[4, 4, 4], [8, 8, 10]]
+
+
+def test_the_subgoal_that_is_due_is_the_one_that_the_last_action_aimed_at(monkeypatch):
+    state = planner(SMALL)
+    memory = leap.adapt(SMALL, leap.begin(SMALL, SPECS["states"], 2), np.array([1.0, 0.6]))
+    due = []
+    for _ in range(10):
+        *_, memory = follow(state, memory, 1, monkeypatch)
+        due.append(leap.AGENT.memory.plan(state, memory).due)
+    # In the last segment, which aims at the goal, it is the last of them.
+    assert np.transpose(due).tolist() == [[0] * 3 + [1] * 3 + [2] * 4, [1] * 3 + [2] * 7]
 
 
 def test_exploration_is_the_tdm_without_a_plan():
@@ -391,7 +402,7 @@ def test_plans_are_told_as_achieved_goals_in_the_units_of_the_environment():
     spec = replace(spec, observation_shape=(7,), goal_shape=(7,), goal_is_observation=True)
     state = create(SMALL, spec)
     memory = leap.begin(SMALL, spec, 2)._replace(latents=jax.random.normal(KEY, (2, 3, 2)))
-    plans = leap.AGENT.memory.plan(state, memory)
+    plans = leap.AGENT.memory.plan(state, memory).subgoals
     assert plans.shape == (2, 3, 7)
     np.testing.assert_allclose(plans, state.vae.decode(memory.latents), rtol=1e-5, atol=1e-5)
 

@@ -18,7 +18,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from midway import functional
-from midway.agent import Agent, EpisodeMemory, Freezing, Pretrain, PretrainSettings
+from midway.agent import Agent, EpisodeMemory, Freezing, Plan, Pretrain, PretrainSettings
 from midway.agents import tdm
 from midway.networks import encoder as encoders
 from midway.networks import optimizer
@@ -113,11 +113,13 @@ def subgoals_of(state: State, latent: Float[Array, "*B L"]) -> Subgoal:
     return encoders.as_subgoal(state.spec, decoded)
 
 
-def planned(state: State, memory: Memory) -> Float[Array, "B N G"]:
-    """Return the plans as achieved goals (environment's units); what is left out is the first."""
+def planned(state: State, memory: Memory) -> Plan:
+    """Return the plans that the last actions followed; what is left out of one is its first."""
     numbers = jnp.maximum(jnp.arange(state.config.num_subgoals), memory.first[:, None])
     latents = jnp.take_along_axis(memory.latents, numbers[..., None], axis=1)
-    return state.encoder.states(subgoals_of(state, latents).achieved_goal)
+    subgoals = state.encoder.states(subgoals_of(state, latents).achieved_goal)
+    segment = segment_of(state, memory._replace(elapsed=memory.elapsed - 1))
+    return Plan(subgoals, due=jnp.clip(segment, 0, state.config.num_subgoals - 1))
 
 
 # --- plan -----------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from midway.agent import AgentState, AnyAgent, Memory, SubgoalDistribution
+from midway.agent import AgentState, AnyAgent, Memory, Plan, SubgoalDistribution
 from midway.runs.policy import Policy
 from midway.training.evaluate import ActionKind, rollout
 from midway.training.progress import stages_of
@@ -39,7 +39,8 @@ class Recording:
         target: What the states have to come near.
         success: Whether the goal was reached.
         final_distance: Distance to the goal at the end (m).
-        plans: Subgoals that the agent followed ``(T, N, ...)``, where it plans any.
+        plans: Subgoals that each action followed ``(T, N, ...)``, where the agent plans any.
+        due: Which of them it aimed at ``(T,)``.
         pictures: What the environment itself draws of every state, where it was asked to.
     """
 
@@ -51,6 +52,7 @@ class Recording:
     success: bool
     final_distance: float
     plans: Array | None = None
+    due: Array | None = None
     pictures: Sequence[Array] = ()
 
     @property
@@ -123,7 +125,7 @@ def pictures(env: VectorGoalEnv) -> list[Array]:
 def _recording(
     policy: Policy,
     seen: list[tuple[Array, Array]],
-    plans: list[Array | None],
+    plans: list[Plan | None],
     number: int,
     lengths: Int[Array, " episodes"],
     task: str,
@@ -135,7 +137,7 @@ def _recording(
     states = np.stack([state[number] for _, state in seen[: length + 1]])
     ends = states[-1:], target[None]
     measure = policy.spec.task
-    followed = [each[number] for each in plans[:length] if each is not None]
+    followed = [each for each in plans[:length] if each is not None]
     return Recording(
         task=task,
         observations=np.stack([observation[number] for observation, _ in seen[: length + 1]]),
@@ -144,7 +146,8 @@ def _recording(
         target=target,
         success=False,
         final_distance=float(measure.distance(*ends)[0]),
-        plans=np.stack(followed) if followed else None,
+        plans=np.stack([each.subgoals[number] for each in followed]) if followed else None,
+        due=np.stack([each.due[number] for each in followed]) if followed else None,
     )
 
 
@@ -162,12 +165,13 @@ def plans(agent: AnyAgent) -> bool:
     return agent.memory is not None and agent.memory.plan is not None
 
 
-def plan(policy: Policy, memory: Memory) -> Array | None:
-    """Return the planned subgoals ``(B, N, G)`` that a memory holds; None if there are none."""
+def plan(policy: Policy, memory: Memory) -> Plan | None:
+    """Return the plans that a memory holds, in NumPy; None if the agent plans nothing."""
     ability = policy.agent.memory
     if ability is None or ability.plan is None:
         return None
-    return np.asarray(_plan(ability.plan, policy.state, memory))
+    found = _plan(ability.plan, policy.state, memory)
+    return Plan(np.asarray(found.subgoals), np.asarray(found.due))
 
 
 @eqx.filter_jit
@@ -236,4 +240,5 @@ def first_plan(
     actor(observation[None], goal[None])
     found = plan(policy, actor.memory)
     assert found is not None
-    return np.asarray(found[0])
+    subgoals: Array = np.asarray(found.subgoals)
+    return subgoals[0]

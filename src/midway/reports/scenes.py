@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol, TypeAlias, cast, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -379,23 +379,21 @@ def decoding(folder: RunFolder, policy: Policy) -> Callable[[Recording], Images 
     fitted = decoder.of_policy(folder, policy)
 
     def decode(recording: Recording) -> Images:
-        if recording.plans is None:
+        if recording.plans is None or recording.due is None:
             features = np.asarray(imagined(policy, recording).location.achieved_goal)
         else:
-            features = _aims(recording.plans, policy.spec.max_episode_steps)
+            features = _aims(recording.plans, recording.due)
         return decoder.decoded(fitted, features)
 
     return decode
 
 
-def _aims(plans: Float[np.ndarray, "T N F"], max_steps: int) -> Float[np.ndarray, "T_1 F"]:
-    """Return the subgoal that is due in every state, and at the end the last of these.
-
-    The subgoals of a plan divide the time of an episode in equal parts.
-    """
-    steps = np.minimum(np.arange(len(plans) + 1), len(plans) - 1)
-    part = -(-max_steps // (plans.shape[1] + 1))
-    return np.asarray(plans[steps, np.minimum(steps // part, plans.shape[1] - 1)])
+def _aims(
+    plans: Float[np.ndarray, "T N F"], due: Int[np.ndarray, " T"]
+) -> Float[np.ndarray, "T_1 F"]:
+    """Return the subgoal that is due in every state, and at the end the last of these."""
+    aims = plans[np.arange(len(plans)), due]
+    return np.concatenate([aims, aims[-1:]])
 
 
 def _head(axes: Axes, title: str) -> None:
