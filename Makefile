@@ -12,7 +12,7 @@ QUICK := tests/test_architecture.py tests/test_dependencies.py tests/test_functi
 # Two workers share the files, so that a file trains its small runs once; conftest.py sorts them.
 PYTEST := $(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 # What must be covered to 95 %: where a mistake would be learned from in silence.
-CAREFUL := */midway/replay/*,*/midway/agents/*,*/midway/training/checkpoint.py
+CAREFUL := */midway/replay/*,*/midway/agents/*,*/midway/training/checkpoint.py,*/midway/training/archive.py
 
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
 

@@ -240,5 +240,4 @@ def first_plan(
     actor(observation[None], goal[None])
     found = plan(policy, actor.memory)
     assert found is not None
-    subgoals: Array = np.asarray(found.subgoals)
-    return subgoals[0]
+    return np.concatenate(found.subgoals)
