@@ -5,7 +5,7 @@ features. No update encodes an image any more, and a checkpoint holds none. Netw
 while features moved would keep a policy whose spread can sit at its clip, without gradient.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar, cast
@@ -65,10 +65,10 @@ class FrozenEnv:
         self.env = env
         self._encode = encode
         self.goal_spec = spec
-
-    def __getattr__(self, name: str) -> Any:
-        """Return what is not an observation from the environment."""
-        return getattr(self.env, name)
+        self.num_envs = env.num_envs
+        self.tasks = env.tasks
+        self.resumable = env.resumable
+        self.logged_info = env.logged_info
 
     def reset(
         self, *, seed: int | None = None, options: Options | None = None
@@ -85,6 +85,18 @@ class FrozenEnv:
         """Take a step in every environment."""
         observation, reward, terminated, truncated, info = self.env.step(actions)
         return self.see(observation), reward, terminated, truncated, info
+
+    def ways(self) -> NumPyArray:
+        """Return how far the goals are."""
+        return self.env.ways()
+
+    def state_dict(self) -> dict[str, NumPyArray]:
+        """Return all that the future depends on."""
+        return self.env.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, NumPyArray]) -> None:
+        """Continue from a ``state_dict``."""
+        self.env.load_state_dict(state)
 
     def see(self, observation: Observations) -> Observations:
         """Return the observation with features; what is seen is also what is achieved."""
