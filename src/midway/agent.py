@@ -69,7 +69,7 @@ class Value(Generic[StateT]):
 
 
 class Plan(NamedTuple):
-    """Subgoals that episodes follow.
+    """Subgoals that B episodes follow, or the B actions of one.
 
     Attributes:
         subgoals: As achieved goals in the environment's units.

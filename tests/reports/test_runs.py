@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from midway import api
+from midway.agents import leap
 from midway.errors import ConfigurationError
 from midway.reports import report
 from midway.reports.cache import Study
+from midway.reports.recordings import record
 from midway.reports.runs import groups, read
 from midway.tables import read as read_table
 
@@ -55,6 +57,18 @@ def test_plans_have_as_many_subgoals_as_are_asked_for(leap_run, tmp_path):
     assert seen[1].where.endswith(", num_subgoals 2")
     assert seen[1].policy.config.hyperparameters.num_subgoals == 2
     np.testing.assert_array_equal(plans[0]["x"], plans[2]["x"])
+
+
+def test_an_episode_knows_which_subgoal_each_action_aimed_at(leap_run):
+    policy = api.load(leap_run)
+    (episode,) = record(policy, {"hard": 1}, seed=0)
+    assert episode.plans is not None
+    assert episode.plans.subgoals.shape == (episode.length, 3, 4)
+    steps = leap.segment_steps(policy.config.hyperparameters, policy.spec)
+    assert 3 * steps < episode.length
+    # In the last segment, which aims at the goal, it is the last one.
+    expected = np.minimum(np.arange(episode.length) // steps, 2)
+    np.testing.assert_array_equal(episode.plans.due, expected)
 
 
 @pytest.mark.parametrize(

@@ -39,8 +39,7 @@ class Recording:
         target: What the states have to come near.
         success: Whether the goal was reached.
         final_distance: Distance to the goal at the end (m).
-        plans: Subgoals that each action followed ``(T, N, ...)``, where the agent plans any.
-        due: Which of them it aimed at ``(T,)``.
+        plans: The plan that each of the T actions followed, where the agent plans.
         pictures: What the environment itself draws of every state, where it was asked to.
     """
 
@@ -51,8 +50,7 @@ class Recording:
     target: Array
     success: bool
     final_distance: float
-    plans: Array | None = None
-    due: Array | None = None
+    plans: Plan | None = None
     pictures: Sequence[Array] = ()
 
     @property
@@ -146,9 +144,13 @@ def _recording(
         target=target,
         success=False,
         final_distance=float(measure.distance(*ends)[0]),
-        plans=np.stack([each.subgoals[number] for each in followed]) if followed else None,
-        due=np.stack([each.due[number] for each in followed]) if followed else None,
+        plans=_of_one(followed, number) if followed else None,
     )
+
+
+def _of_one(plans: list[Plan], number: int) -> Plan:
+    """Return the plans of one episode, step by step."""
+    return Plan(*(np.stack([part[number] for part in parts]) for parts in zip(*plans, strict=True)))
 
 
 def _reset(env: VectorGoalEnv, tasks: Array, seed: int) -> dict[str, Array]:
@@ -203,7 +205,8 @@ def imagined(policy: Policy, recording: Recording) -> SubgoalDistribution:
 def in_every_state(policy: Policy, recording: Recording) -> Float[np.ndarray, "T I G"] | None:
     """Return the subgoals in every state, imagined or planned; None if the agent has none."""
     if recording.plans is not None:
-        return np.concatenate([recording.plans, recording.plans[-1:]])
+        subgoals = np.asarray(recording.plans.subgoals)
+        return np.concatenate([subgoals, subgoals[-1:]])
     if policy.agent.subgoals is None:
         return None
     return draws(imagined(policy, recording), SUBGOALS)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol, TypeAlias, cast, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.text import Text
 
+from midway.agent import Plan
 from midway.envs.geodesic import way_left
 from midway.envs.views import MazeView, TableView
 from midway.reports import decoder, style, tabletop
@@ -379,20 +380,18 @@ def decoding(folder: RunFolder, policy: Policy) -> Callable[[Recording], Images 
     fitted = decoder.of_policy(folder, policy)
 
     def decode(recording: Recording) -> Images:
-        if recording.plans is None or recording.due is None:
+        if recording.plans is None:
             features = np.asarray(imagined(policy, recording).location.achieved_goal)
         else:
-            features = _aims(recording.plans, recording.due)
+            features = _aims(recording.plans)
         return decoder.decoded(fitted, features)
 
     return decode
 
 
-def _aims(
-    plans: Float[np.ndarray, "T N F"], due: Int[np.ndarray, " T"]
-) -> Float[np.ndarray, "T_1 F"]:
+def _aims(plans: Plan) -> Float[np.ndarray, "T_1 F"]:
     """Return the subgoal that is due in every state, and at the end the last of these."""
-    aims = plans[np.arange(len(plans)), due]
+    aims = np.asarray(plans.subgoals)[np.arange(len(plans.due)), plans.due]
     return np.concatenate([aims, aims[-1:]])
 
 
