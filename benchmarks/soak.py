@@ -25,7 +25,7 @@ RESULTS = Path(__file__).parent / "results" / "soak"
 SMALL = ("hidden=(64, 64)", "batch_size=64", "log_every=500", "evaluation_episodes=4")
 OFTEN = ("evaluate_every=4000", "checkpoint_every=4000", "replay_capacity=10000")
 RUNS = ("point-u", "PandaReach-v3")
-"""The second one's environments are stepped by processes of their own."""
+"""The second one's environments are stepped by processes of their own, on two cores or more."""
 QUANTITIES = ("resident_mb", "descriptors", "threads", "processes")
 WARM_UP = 0.2
 """Share of the samples before the slope: programs are compiled, and the replay fills."""
