@@ -69,11 +69,9 @@ class Value(Generic[StateT]):
 
 
 class Plan(NamedTuple):
-    """Subgoals that B episodes follow, or the B actions of one.
+    """Subgoals that B episodes follow, or the B actions of one; and which of them is due.
 
-    Attributes:
-        subgoals: As achieved goals in the environment's units.
-        due: Which of them is aimed at; the last one when the goal itself is.
+    They are achieved goals in the environment's units. The last one is due when the goal itself is.
     """
 
     subgoals: Float[AnyArray, "B N G"]
