@@ -243,4 +243,4 @@ def first_plan(
     actor(observation[None], goal[None])
     found = plan(policy, actor.memory)
     assert found is not None
-    return np.concatenate(found.subgoals)
+    return np.squeeze(found.subgoals, axis=0)
