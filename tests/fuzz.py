@@ -27,7 +27,7 @@ from midway import api, files, presets, tables
 from midway.agents import registry as agents
 from midway.cluster.jobs import last_success
 from midway.envs import layouts, registry
-from midway.envs.foreign import Foreign, Settings
+from midway.envs.describing import Foreign, Settings
 from midway.envs.sources import Source
 from midway.envs.success import AskedRule, DistanceRule
 from midway.errors import ConfigurationError

@@ -8,7 +8,7 @@ from pathlib import Path
 from midway.agent import AnyAgent
 from midway.configuration import configure as configure
 from midway.configuration import setup_of as setup_of
-from midway.envs.foreign import EnvLike
+from midway.envs.describing import EnvLike
 from midway.envs.registry import Declaration
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
 from midway.runs import complete, kept

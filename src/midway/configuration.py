@@ -7,9 +7,9 @@ from pathlib import Path
 from midway import presets
 from midway.agent import AnyAgent
 from midway.agents import registry as agents
-from midway.envs import datasets, foreign, layouts
+from midway.envs import datasets, describing, layouts
 from midway.envs import registry as environments
-from midway.envs.foreign import EnvLike, Foreign, Settings
+from midway.envs.describing import EnvLike, Foreign, Settings
 from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
 from midway.runs.folder import RunConfig, RunFolder
@@ -50,7 +50,7 @@ def goal_env(
     said = Settings(
         success_distance, success_function, max_episode_steps, action_bound, step_seconds
     )
-    return foreign.admit(foreign.describe(env, said, kwargs, tuple(imports)))
+    return describing.admit(describing.describe(env, said, kwargs, tuple(imports)))
 
 
 def maze_env(robot: str, maze: str | Path) -> Declaration:

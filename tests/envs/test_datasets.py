@@ -10,7 +10,7 @@ import pytest
 import midway
 import tiny
 from midway.envs.datasets import trajectories
-from midway.envs.foreign import Settings, describe
+from midway.envs.describing import Settings, describe
 from midway.errors import ConfigurationError
 from midway.replay import buffer
 from midway.training import demonstrations

@@ -5,8 +5,8 @@ from typing import Any
 import fakes
 import pytest
 
+from midway.envs.describing import Settings
 from midway.envs.examine import Finding, examine
-from midway.envs.foreign import Settings
 
 
 def found(options: dict[str, Any], settings: Settings | None = None) -> list[Finding]:

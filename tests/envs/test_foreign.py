@@ -20,7 +20,8 @@ from gymnasium.error import ResetNeeded
 
 import midway
 import tiny
-from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, admit, describe, with_limit
+from midway.envs.describing import Foreign, Settings, admit, describe, with_limit
+from midway.envs.foreign import ForeignVectorEnv
 from midway.envs.goals_in_info import GoalsInInfo
 from midway.envs.sources import source
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
@@ -304,7 +305,8 @@ import sys, time
 import numpy as np, gymnasium
 sys.path.insert(0, {folder!r})
 import fakes
-from midway.envs.foreign import ForeignVectorEnv, describe
+from midway.envs.describing import describe
+from midway.envs.foreign import ForeignVectorEnv
 
 class Mine(fakes.Plane):
     "A class of the script itself, which no process can import."

@@ -16,7 +16,8 @@ import midway
 from midway.agents import registry
 from midway.configuration import configure
 from midway.envs import own_spaces
-from midway.envs.foreign import ForeignVectorEnv, describe
+from midway.envs.describing import describe
+from midway.envs.foreign import ForeignVectorEnv
 from midway.errors import ConfigurationError
 from midway.runs import export
 from midway.runs.policy import Policy

@@ -14,7 +14,8 @@ from gymnasium.utils.seeding import np_random
 import midway
 import tiny
 from midway.cli.main import main
-from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, describe
+from midway.envs.describing import Foreign, Settings, describe
+from midway.envs.foreign import ForeignVectorEnv
 from midway.envs.success import AskedRule, DistanceRule
 from midway.errors import ConfigurationError
 

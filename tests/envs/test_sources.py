@@ -13,7 +13,7 @@ import gymnasium
 import pytest
 
 from midway.envs import packages
-from midway.envs.foreign import Settings, describe
+from midway.envs.describing import Settings, describe
 from midway.envs.sources import Source, UnknownEnvironmentError, source
 from midway.errors import ConfigurationError
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from midway.envs import deciding, success
-from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, describe
+from midway.envs.describing import Foreign, Settings, describe
+from midway.envs.foreign import ForeignVectorEnv
 from midway.envs.success import AskedRule, DistanceRule, FunctionRule
 from midway.errors import ConfigurationError
 from midway.types import GoalTask

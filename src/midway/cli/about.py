@@ -9,7 +9,7 @@ import tyro
 from midway.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from midway.envs.foreign import Foreign, Settings
+    from midway.envs.describing import Foreign, Settings
     from midway.envs.registry import Declaration
     from midway.types import JsonObject
 
@@ -46,7 +46,7 @@ class About:
         """
         if self == NOTHING:
             return name
-        from midway.envs import foreign, layouts
+        from midway.envs import describing, layouts
         from midway.envs.registry import ENVIRONMENTS, own_maze
 
         if self.maze is not None and self == About(maze=self.maze):
@@ -55,11 +55,11 @@ class About:
             raise ConfigurationError(
                 f"{' '.join(self.options())}: {name} is midway's own, of which nothing need be said"
             )
-        return foreign.admit(foreign.describe(name, self.settings(), **self.source()))
+        return describing.admit(describing.describe(name, self.settings(), **self.source()))
 
     def settings(self) -> "Settings":
         """Return what is said of success, length and actions."""
-        from midway.envs.foreign import Settings
+        from midway.envs.describing import Settings
 
         return Settings(
             self.success_distance,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from midway.envs.foreign import Foreign
+from midway.envs.describing import Foreign
 from midway.envs.group import action_bounds
 from midway.envs.reading import GOAL_KEYS, STATE_KEYS, readings
 from midway.envs.success import judge

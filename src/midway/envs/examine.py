@@ -8,7 +8,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from midway.envs.deciding import REMEDY
-from midway.envs.foreign import Foreign, ForeignVectorEnv, Settings, describe
+from midway.envs.describing import Foreign, Settings, describe
+from midway.envs.foreign import ForeignVectorEnv
 from midway.envs.success import judge
 from midway.errors import ConfigurationError
 from midway.types import (

@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
 from jaxtyping import Float
 
-from midway.envs.foreign import Foreign
+from midway.envs.describing import Foreign
 from midway.envs.group import action_bounds, scaled
 from midway.envs.reading import GOAL_KEYS, Array, readings
 from midway.envs.success import judge

@@ -12,7 +12,7 @@ from midway.envs.views import MazeView, TableView, View
 from midway.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from midway.envs.foreign import EnvLike, Foreign
+    from midway.envs.describing import EnvLike, Foreign
     from midway.envs.layouts import Layout
     from midway.envs.vector import GoalVectorEnv
 
@@ -177,10 +177,10 @@ def entry(env: "EnvLike | Declaration") -> Declaration:
         return env
     if isinstance(env, str) and env in ENVIRONMENTS:
         return ENVIRONMENTS[env]
-    from midway.envs import foreign, sources
+    from midway.envs import describing, sources
 
     try:
-        described = env if isinstance(env, foreign.Foreign) else foreign.described(env)
+        described = env if isinstance(env, describing.Foreign) else describing.described(env)
     except sources.UnknownEnvironmentError as error:
         raise ConfigurationError(
             f"{error}; midway's own are {', '.join(ENVIRONMENTS)}, and any goal environment goes "

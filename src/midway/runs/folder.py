@@ -11,7 +11,7 @@ from pathlib import Path
 from midway import files
 from midway.agents import registry
 from midway.envs import registry as environments
-from midway.envs.foreign import Foreign
+from midway.envs.describing import Foreign
 from midway.envs.layouts import Layout
 from midway.envs.registry import Declaration
 from midway.errors import ConfigurationError
