@@ -180,14 +180,19 @@ def test_failed_runs_are_no_trials_to_choose_from(runs: Runs, tmp_path: Path) ->
         tune.winner(study, PLAN)
 
 
-def test_the_score_is_the_mean_over_evaluations_and_seeds(tmp_path: Path) -> None:
+def test_the_score_is_the_mean_over_tasks_evaluations_and_seeds(tmp_path: Path) -> None:
     plan = tune.Plan("point-u", "ris", "quick", 200, (0, 1), SPACE, PLAN.first)
-    for seed, rates in ((0, (0.0, 1.0)), (1, (0.5, 0.5))):
+    for seed, (hard, uniform) in enumerate((((0.0, 0.5), (0.5, 1.0)), ((0.0, 0.0), (1.0, 1.0)))):
         file = RunFolder(tmp_path / plan.job(3, seed, {}).name).evaluation_file
         file.parent.mkdir()
-        rows = [f"{100 * (i + 1)},hard,mean,{rate}\n" for i, rate in enumerate(rates)]
+        rows = [
+            f"{step},{task},{actions},{rate if actions == 'mean' else 1.0}\n"
+            for step, *rates in ((100, hard[0], uniform[0]), (200, hard[1], uniform[1]))
+            for task, rate in zip(("hard", "uniform"), rates, strict=True)
+            for actions in ("mean", "sampled")
+        ]
         file.write_text(HEADER + "".join(rows))
-    assert tune.curve(plan, tmp_path, 3) == [(100, 0), (200, 0.5), (300, 0.5), (400, 0.5)]
+    assert tune.curve(plan, tmp_path, 3) == [(100, 0.25), (200, 0.5), (300, 0.5), (400, 0.5)]
 
 
 def test_a_process_is_ended_once_when_asked(

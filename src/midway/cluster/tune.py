@@ -239,8 +239,8 @@ def _try(
 def curve(plan: Plan, folder: Path, number: int) -> list[tuple[int, float]]:
     """Return the score of a trial after each evaluation of its runs, seeds one after the other.
 
-    The score is the mean success of all evaluations so far (deterministic policy; ``hard`` where
-    there is it): learning sooner counts, and so does keeping it.
+    The score is the mean success of all evaluations so far, each the mean of its tasks
+    (deterministic policy): learning sooner counts, keeping it, and what is on the way to ``hard``.
     """
     steps: list[int] = []
     success: list[float] = []
@@ -248,12 +248,13 @@ def curve(plan: Plan, folder: Path, number: int) -> list[tuple[int, float]]:
         file = RunFolder(folder / plan.job(number, seed, {}).name).evaluation_file
         try:
             table = tables.read(file)
-            shown = (table["actions"] == "mean") & (table["task"] != "uniform")
-            shown = shown if shown.any() else table["actions"] == "mean"
-            steps += [index * plan.steps + int(step) for step in table["step"][shown]]
-            success += [float(rate) for rate in table["success_rate"][shown]]
+            shown = table["actions"] == "mean"
+            rates = table["success_rate"][shown].astype(float)
+            at, row = np.unique(table["step"][shown].astype(int), return_inverse=True)
         except (ConfigurationError, KeyError):  # no evaluation yet
             break
+        steps += (index * plan.steps + at).tolist()
+        success += (np.bincount(row, rates) / np.bincount(row)).tolist()
     means = np.cumsum(success) / np.arange(1, len(success) + 1)
     return list(zip(steps, means.tolist(), strict=True))
 
