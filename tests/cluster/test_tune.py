@@ -49,7 +49,7 @@ class Runs:
         success = 1 - abs(float(values["kl_weight"]) - 0.5)
         text = HEADER
         for step in (100, 200, 300, 400):
-            text += f"{step},uniform,mean,0.0\n{step},hard,sampled,0.0\n"
+            text += f"{step},uniform,mean,{success}\n{step},hard,sampled,0.0\n"
             text += f"{step},hard,mean,{success}\n"
             file.write_text(text)
             if stop():
