@@ -246,6 +246,10 @@ def test_from_the_command_line(
     assert told.count("trial 1  complete") == 1
     assert "quick itself: 0.6" in said
     assert str(out / "best.toml") in said
+    header, *rows = (out / "trials.csv").read_text().splitlines()
+    assert header.startswith("trial,state,score,critic_learning_rate,")
+    assert [row.split(",")[:2] for row in rows] == [["0", "complete"], ["1", "complete"]]
+    assert rows[0].split(",")[2] == "0.600"
     found = presets.resolve("point-u", "ris", str(out / "best.toml"))
     assert found.hyperparameters.hidden == (8,)  # type: ignore[attr-defined]
     for wrong in (["--trials", "0"], ["--set", "kl_weight=1"], ["--agent", "dqn"]):

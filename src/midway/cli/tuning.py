@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
+from midway import tables
 from midway.cli.about import NOTHING, AboutEnv
 from midway.cli.parsing import Count, OptionalCount, settings
 from midway.errors import ConfigurationError
@@ -81,6 +82,7 @@ def tune(
         sys.exit(EXIT_INTERRUPTED)
     number, score, own = tuning.scores(study)
     (out / "best.toml").write_text(tuning.winner(study, plan))
+    tables.write(out / "trials.csv", tuning.results(study))
     compared = "did not end" if own is None else f"{own:.3f}"
     print(f"trial {number}: mean success {score:.3f} over training; {preset} itself: {compared}")
     print(f"{out / 'best.toml'}")

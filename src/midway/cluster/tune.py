@@ -297,6 +297,19 @@ def scores(study: "optuna.Study") -> tuple[int, float, float | None]:
     return complete[0].number, float(complete[0].value or 0), preset
 
 
+def results(study: "optuna.Study") -> tables.Table:
+    """Return number, state, score and values of every trial, as columns."""
+    trials = study.get_trials(deepcopy=False)
+    columns: dict[str, list[object]] = {
+        "trial": [trial.number for trial in trials],
+        "state": [trial.state.name.lower() for trial in trials],
+        "score": [_score(trial) for trial in trials],
+    }
+    for name in dict.fromkeys(name for trial in trials for name in trial.params):
+        columns[name] = [trial.params.get(name, "") for trial in trials]
+    return {name: np.array(column, dtype=object) for name, column in columns.items()}
+
+
 def _complete(study: "optuna.Study") -> list["optuna.trial.FrozenTrial"]:
     import optuna
 
