@@ -64,7 +64,7 @@ SUITES: dict[str, list[Job]] = {
         Job("ant-u", "sac", 0),
     ],
     "ant-mazes": [
-        *(Job(env, "ris", seed) for env in LONG_WAYS for seed in range(3)),
+        *(Job(env, "ris", seed) for seed in range(3) for env in LONG_WAYS),
         *(Job(env, agent, 0) for env in LONG_WAYS for agent in ("sac", "leap")),
         *(Job("ant-u", agent, 0) for agent in ("leap", "tdm")),
     ],
