@@ -68,6 +68,11 @@ class GoalTask(Protocol):
         """Return the distance to the goal ``(B,)`` that success is measured by."""
         ...
 
+    @property
+    def description(self) -> str:
+        """When a goal counts as reached, as the end of a sentence for the user."""
+        ...
+
 
 @dataclass(frozen=True)
 class DistanceTask:
@@ -83,6 +88,12 @@ class DistanceTask:
     groups: tuple[tuple[int, ...], ...]
     threshold: float
     names: tuple[str, ...] = ()
+
+    @property
+    def description(self) -> str:
+        """When a goal counts as reached, as the end of a sentence for the user."""
+        parts = self.names or [f"coordinates {list(group)}" for group in self.groups]
+        return f"within {self.threshold:.6g} of the goal in {' and '.join(parts)}"
 
     def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
         """Return the largest of the groups' distances ``(B,)`` (m)."""
@@ -111,6 +122,8 @@ class DistanceTask:
 @dataclass(frozen=True)
 class UnknownTask:
     """Success of an environment whose rule is not stored with the policy."""
+
+    description = "as the environment alone knows"
 
     def distance(self, achieved: ArrayLike, desired: ArrayLike) -> ArrayLike:
         """Raise a ConfigurationError: only the environment itself can tell."""

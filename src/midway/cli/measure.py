@@ -18,7 +18,7 @@ def check(
     seconds: float = 15.0,
     about: AboutEnv = NOTHING,
 ) -> None:
-    """Say what midway sees of a goal environment, and what is wrong with it.
+    """Say what midway sees of an environment, and what is wrong with it.
 
     Args:
         env: Environment name, a Gymnasium id, module:Id or module:callable.
@@ -27,8 +27,11 @@ def check(
         about: What midway must be told of an environment that is not its own.
     """
     from midway.envs import examine
+    from midway.envs.registry import ENVIRONMENTS
 
-    findings = examine.examine(env, about.settings(), num_envs, seconds, **about.source())
+    own = about.maze is not None or env in ENVIRONMENTS
+    seen = about.env(env) if own else env
+    findings = examine.examine(seen, about.settings(), num_envs, seconds, **about.source())
     for label, text, _ in findings:
         print(f"{label:15} {text}")
     if not all(ok for _, _, ok in findings):

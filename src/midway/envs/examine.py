@@ -1,4 +1,4 @@
-"""What midway sees of an environment that is not its own, in about ten lines."""
+"""What midway sees of an environment, in about ten lines."""
 
 import itertools
 import time
@@ -7,17 +7,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from midway.envs import registry
 from midway.envs.deciding import REMEDY
 from midway.envs.describing import Foreign, Settings, describe
-from midway.envs.foreign import ForeignVectorEnv
+from midway.envs.registry import Declaration
 from midway.envs.success import judge
+from midway.envs.vector import GoalVectorEnv
 from midway.errors import ConfigurationError
-from midway.types import (
-    EnvSpec,
-    NamedValues,
-    NumPyArray,
-    OwnEnv,
-)
+from midway.types import EnvSpec, NamedValues, NumPyArray, Observations, OwnEnv
 
 Finding: TypeAlias = tuple[str, str, bool]
 """What was looked at, what was found, and whether it is well."""
@@ -40,11 +37,15 @@ class Tally:
         nearest: Smallest distance to a goal.
         at_once: Goals that were reached before the first action.
         begun: Episodes that began.
+        lowest: Smallest value of each entry of an observation.
+        highest: Largest value.
     """
 
     reached: list[int]
     failed: list[int]
     late: list[int]
+    lowest: NumPyArray
+    highest: NumPyArray
     steps: int = 0
     seconds: float = 0.0
     nearest: float = np.inf
@@ -67,40 +68,43 @@ def examine(
     """Return what midway sees of an environment, one finding for a line.
 
     Args:
-        env: A name, a callable that makes environments, or what ``gymnasium.make`` returned.
-        settings: What the user says of it.
+        env: A name, a declaration, a callable that makes environments, or what ``gymnasium.make``
+            returned.
+        settings: What the user says of one that is not midway's.
         num_envs: Environments stepped together to measure.
         seconds: How long random actions are taken, at most.
         source: ``kwargs`` and ``imports``, as of `describe`.
     """
+    own = isinstance(env, Declaration) or (isinstance(env, str) and env in registry.ENVIRONMENTS)
     try:
-        foreign = describe(env, settings, **source)
+        declared = registry.entry(env if own else describe(env, settings, **source))
     except ConfigurationError as error:
         return [("wrong", str(error), False)]
-    spaces = judge(foreign.source).observation_space
+    made = declared.factory(num_envs)
+    spec, foreign = made.goal_spec, declared.foreign
     findings = [
-        ("environment", foreign.spec.name, True),
-        ("observation", _observation(foreign, spaces), True),
-        ("goal", _goal(foreign, spaces), True),
-        ("actions", _actions(foreign), True),
-        ("success", f"a goal is reached {foreign.rule.description}", True),
+        ("environment", declared.name, True),
+        ("observation", _observation(spec, foreign), True),
+        ("goal", _goal(spec, foreign), True),
+        ("actions", _actions(spec, foreign), True),
+        ("success", f"a goal is reached {spec.task.description}", True),
     ]
     try:
-        tally = _random_episodes(foreign, num_envs, seconds)
+        tally = _random_episodes(made, seconds)
     except (ConfigurationError, RuntimeError) as error:
         return [*findings, ("wrong", " ".join(str(error).split()), False)]
-    return [*findings, *_judged(foreign, tally, num_envs)]
+    finally:
+        made.close()
+    return [*findings, *_judged(spec, tally, num_envs)]
 
 
-def _observation(foreign: Foreign, spaces: Any) -> str:
-    spec = foreign.spec
+def _observation(spec: EnvSpec, foreign: Foreign | None) -> str:
     shown = f"{spec.observation_shape} {spec.observation_dtype}"
-    return f"{shown}, read from {_space(spaces['observation'])}"
+    return f"{shown}{_read_from(foreign, 'observation')}"
 
 
-def _goal(foreign: Foreign, spaces: Any) -> str:
-    spec = foreign.spec
-    return f"{spec.goal_shape}, read from {_space(spaces['desired_goal'])}: {_role(spec)}"
+def _goal(spec: EnvSpec, foreign: Foreign | None) -> str:
+    return f"{spec.goal_shape}{_read_from(foreign, 'desired_goal')}: {_role(spec)}"
 
 
 def _role(spec: EnvSpec) -> str:
@@ -110,46 +114,45 @@ def _role(spec: EnvSpec) -> str:
     return f"entries {list(spec.goal_coordinates)} of the observation"
 
 
-def _space(space: Any) -> str:
+def _read_from(foreign: Foreign | None, key: str) -> str:
+    """Return which space is read; nothing for an environment of midway's own."""
+    if foreign is None:
+        return ""
+    space = judge(foreign.source).observation_space[key]
     if space.shape is None:
-        return type(space).__name__
-    return f"{type(space).__name__} {space.shape} {space.dtype}"
+        return f", read from {type(space).__name__}"
+    return f", read from {type(space).__name__} {space.shape} {space.dtype}"
 
 
-def _actions(foreign: Foreign) -> str:
+def _actions(spec: EnvSpec, foreign: Foreign | None) -> str:
+    if foreign is None:
+        return f"{spec.action_dim}, from -1 to 1"
     space = judge(foreign.source).action_space
-    low, high = float(space.low.min()), float(space.high.max())
     if not space.is_bounded():
-        bound = foreign.settings.action_bound
-        return f"{foreign.spec.action_dim}, without bounds: {bound} is given"
-    return f"{foreign.spec.action_dim}, from {low:.4g} to {high:.4g}"
+        return f"{spec.action_dim}, without bounds: {foreign.settings.action_bound} is given"
+    return f"{spec.action_dim}, from {space.low.min():.4g} to {space.high.max():.4g}"
 
 
-def _random_episodes(foreign: Foreign, num_envs: int, seconds: float) -> Tally:
+def _random_episodes(env: GoalVectorEnv, seconds: float) -> Tally:
     """Return how episodes of random actions end."""
-    tally = Tally([], [], [])
-    env = ForeignVectorEnv(foreign, num_envs)
     rng = np.random.default_rng(0)
-    try:
-        _, info = env.reset(seed=0)
-        _note_begun(tally, info, np.ones(num_envs, np.bool_))
-        started = time.perf_counter()
-        for _ in itertools.count():
-            action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
-            begun = time.perf_counter()
-            _, _, terminated, truncated, info = env.step(action)
-            tally.seconds += time.perf_counter() - begun
-            tally.steps += num_envs
-            tally.nearest = min(tally.nearest, float(info["distance"].min()))
-            _note_ended(tally, info, terminated | truncated)
-            if tally.ended >= EPISODES or time.perf_counter() - started > seconds:
-                return tally
-            if (terminated | truncated).any():
-                mask = terminated | truncated
-                _, info = env.reset(options={"reset_mask": mask})
-                _note_begun(tally, info, mask)
-    finally:
-        env.close()
+    shown, info = env.reset(seed=0)
+    tally = Tally([], [], [], shown["observation"].min(0), shown["observation"].max(0))
+    _note_begun(tally, info, np.ones(env.num_envs, np.bool_))
+    started = time.perf_counter()
+    for _ in itertools.count():
+        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        begun = time.perf_counter()
+        shown, _, terminated, truncated, info = env.step(action)
+        tally.seconds += time.perf_counter() - begun
+        tally.steps += env.num_envs
+        _note_step(tally, shown, info, terminated | truncated)
+        if tally.ended >= EPISODES or time.perf_counter() - started > seconds:
+            break
+        if (terminated | truncated).any():
+            mask = terminated | truncated
+            _, info = env.reset(options={"reset_mask": mask})
+            _note_begun(tally, info, mask)
     return tally
 
 
@@ -158,16 +161,20 @@ def _note_begun(tally: Tally, info: NamedValues, mask: NumPyArray) -> None:
     tally.at_once += int((info["is_success"] & mask).sum())
 
 
-def _note_ended(tally: Tally, info: NamedValues, ended: NumPyArray) -> None:
+def _note_step(tally: Tally, shown: Observations, info: NamedValues, ended: NumPyArray) -> None:
+    tally.nearest = min(tally.nearest, float(info["distance"].min()))
+    tally.lowest = np.minimum(tally.lowest, shown["observation"].min(0))
+    tally.highest = np.maximum(tally.highest, shown["observation"].max(0))
+    failures = info.get("failed", np.zeros_like(ended))  # midway's own never fail
     for copy in np.flatnonzero(ended):
-        reached, failed = info["is_success"][copy], info["failed"][copy]
+        reached, failed = info["is_success"][copy], failures[copy]
         kind = tally.reached if reached else tally.failed if failed else tally.late
         kind.append(int(info["elapsed_steps"][copy]))
 
 
-def _judged(foreign: Foreign, tally: Tally, num_envs: int) -> list[Finding]:
+def _judged(spec: EnvSpec, tally: Tally, num_envs: int) -> list[Finding]:
     """Return findings about random actions, and what is wrong with them."""
-    limit = foreign.spec.max_episode_steps
+    limit = spec.max_episode_steps
     kinds = (("success", tally.reached), ("failure", tally.failed), ("the limit", tally.late))
     ends = [f"{len(lengths)} by {name} ({_range(lengths)})" for name, lengths in kinds if lengths]
     rate = len(tally.reached) / tally.ended if tally.ended else 0.0
@@ -181,9 +188,20 @@ def _judged(foreign: Foreign, tally: Tally, num_envs: int) -> list[Finding]:
             True,
         ),
         ("endings", ", ".join(ends) or "none yet", True),
+        ("ranges", _ranges(tally), True),
         ("speed", f"{speed:,.0f} steps per second of {num_envs} environments", True),
     ]
-    return findings + [("wrong", text, False) for text in _faults(foreign, tally, rate, at_once)]
+    return findings + [("wrong", text, False) for text in _faults(spec, tally, rate, at_once)]
+
+
+def _ranges(tally: Tally) -> str:
+    """Return how far the entries of observations go, and how unequal they are."""
+    low, high = tally.lowest.astype(float), tally.highest.astype(float)
+    widths = (high - low)[high > low]
+    text = f"observations lie between {low.min():.4g} and {high.max():.4g}"
+    if not widths.size:
+        return f"{text}, and never change"
+    return f"{text}; entries vary by {widths.min():.3g} to {widths.max():.3g}"
 
 
 def _range(lengths: list[int]) -> str:
@@ -191,7 +209,7 @@ def _range(lengths: list[int]) -> str:
     return f"after {low} steps" if low == high else f"after {low} to {high} steps"
 
 
-def _faults(foreign: Foreign, tally: Tally, rate: float, at_once: float) -> list[str]:
+def _faults(spec: EnvSpec, tally: Tally, rate: float, at_once: float) -> list[str]:
     faults = []
     if at_once > 0.5:
         faults.append(f"{at_once:.0%} of the goals are reached before the first action: {REMEDY}")
@@ -202,6 +220,6 @@ def _faults(foreign: Foreign, tally: Tally, rate: float, at_once: float) -> list
             f"every failure comes after {tally.failed[0]} steps: if that is its limit of time, "
             f"give --max-episode-steps {tally.failed[0]}"
         )
-    if "which is slow" in foreign.rule.description:
+    if "which is slow" in spec.task.description:
         faults.append("success is asked pair by pair: --success-distance, or batches, are faster")
     return faults

@@ -45,8 +45,7 @@ class DistanceRule(DistanceTask):
     @property
     def description(self) -> str:
         """The rule as one line for the user."""
-        groups = " and ".join(f"coordinates {list(group)}" for group in self.groups)
-        return f"within {self.threshold:.6g} of the goal in {groups} ({self.because})"
+        return f"{super().description} ({self.because})"
 
     def to_json(self) -> JsonObject:
         """Return what a run folder stores."""
