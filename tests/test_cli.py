@@ -93,6 +93,12 @@ def test_version_and_help_say_what_there_is(capsys: pytest.CaptureFixture[str]) 
         assert said in words
 
 
+def test_settings_are_printed_for_a_maze_of_ones_own(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "presets", "point", "ris", "--maze", "umaze")
+    assert status == 0
+    assert "kl_weight" in out
+
+
 def test_runs_are_listed_with_their_states(
     capsys: pytest.CaptureFixture[str], trained: Path, tmp_path: Path
 ) -> None:
@@ -108,6 +114,7 @@ def test_runs_are_listed_with_their_states(
     states = {name: row["state"] for name, row in found.items()}
     expected = {"whole": "finished", "begun": "interrupted", "busy": "running"}
     assert states == expected | {"damaged": "broken"}
+    assert found["begun"]["why"].startswith("no checkpoint of step ")
     assert found["whole"]["success"] is not None
     assert found["whole"]["step"] == found["whole"]["steps"]
     status, out, _ = run(capsys, "runs", str(tmp_path))

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from midway import settings
 from midway.agents import registry as agents
@@ -22,6 +22,9 @@ from midway.networks.mlp import fastest_precision
 from midway.plain import check_kinds
 from midway.training.config import TrainConfig
 from midway.types import Hyperparameters, RelabelMix
+
+if TYPE_CHECKING:
+    from midway.envs.describing import EnvLike
 
 Values: TypeAlias = Mapping[str, object]
 
@@ -364,12 +367,12 @@ NAMES = ("paper", "quick")
 
 
 def resolve(
-    env: str | Declaration, agent: str, preset: str = "quick", changes: Values | None = None
+    env: "EnvLike | Declaration", agent: str, preset: str = "quick", changes: Values | None = None
 ) -> Resolved:
     """Return the settings of a preset for an environment and an agent.
 
     Args:
-        env: Environment name, or its declaration.
+        env: Environment name, its declaration, or another environment.
         agent: Agent name.
         preset: ``paper``, ``quick``, or the path of a preset file.
         changes: Values that win over the preset's.

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from midway.cli.about import NOTHING, AboutEnv
 from midway.cli.parsing import plain, print_json, settings
 
 
@@ -53,6 +54,7 @@ def presets(
     preset: str = "quick",
     set: tuple[str, ...] = (),
     json: bool = False,
+    about: AboutEnv = NOTHING,
 ) -> None:
     """Print every setting of a preset with its value and where that comes from.
 
@@ -62,11 +64,12 @@ def presets(
         preset: paper, quick, or a file ending in .toml.
         set: Other settings of the preset, as NAME=VALUE.
         json: Print one JSON object.
+        about: What midway must be told of an environment that is not its own.
     """
     from midway import presets as rules
     from midway import settings as declarations
 
-    resolved = rules.resolve(env, agent, preset, settings(set))
+    resolved = rules.resolve(about.env(env), agent, preset, settings(set))
     rows = [
         (name, value, resolved.sources.get(name, rules.Source("default of the agent")), allowed)
         for config in (resolved.train, resolved.hyperparameters)

@@ -58,7 +58,7 @@ def state_of(path: Path) -> RunState:
     if lost:
         return RunState("broken", step, steps, "its checkpoints are gone")
     return (
-        RunState("interrupted", step, steps, missing)
+        RunState("interrupted", step, steps, f"no {missing}")
         if missing
         else RunState("finished", step, steps)
     )
