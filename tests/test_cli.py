@@ -103,6 +103,7 @@ def test_runs_are_listed_with_their_states(
     capsys: pytest.CaptureFixture[str], trained: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(trained, tmp_path / "whole")
+    shutil.copytree(trained, tmp_path / "lost", ignore=shutil.ignore_patterns("checkpoints"))
     for name in ("begun", "busy", "sweep/damaged"):
         (tmp_path / name).mkdir(parents=True)
         shutil.copy(trained / "config.json", tmp_path / name)
@@ -113,12 +114,13 @@ def test_runs_are_listed_with_their_states(
     assert status == 0
     states = {name: row["state"] for name, row in found.items()}
     expected = {"whole": "finished", "begun": "interrupted", "busy": "running"}
-    assert states == expected | {"damaged": "broken"}
+    assert states == expected | {"damaged": "broken", "lost": "broken"}
+    assert "its policy of step" in found["lost"]["why"]
     assert found["begun"]["why"].startswith("no checkpoint of step ")
     assert found["whole"]["success"] is not None
     assert found["whole"]["step"] == found["whole"]["steps"]
     status, out, _ = run(capsys, "runs", str(tmp_path))
-    assert len(out.splitlines()) == 4
+    assert len(out.splitlines()) == 5
     assert "is damaged" in out
     status, out, _ = run(capsys, "runs", str(tmp_path / "whole"))
     assert out.startswith(str(tmp_path / "whole"))

@@ -56,7 +56,9 @@ def state_of(path: Path) -> RunState:
     if folder.in_use():
         return RunState("running", step, steps)
     if lost:
-        return RunState("broken", step, steps, "its checkpoints are gone")
+        kept = complete.policy_step(folder)
+        left = "" if kept is None else f"; its policy of step {kept:,} is there"
+        return RunState("broken", step, steps, f"its checkpoints are gone{left}")
     return (
         RunState("interrupted", step, steps, f"no {missing}")
         if missing
