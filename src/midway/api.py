@@ -300,6 +300,7 @@ def _run(
         folder.best_weights.unlink(missing_ok=True)
     steps, training.ends_at = training.counters.steps, folder.ended_at()
     checkpoints.set_aside_after(steps)
+    checkpoints.remove_old()  # a process may have been killed before it did
     files = folder.metrics_file, folder.evaluation_file, folder.path / "events"
     with closing(Logger(*files, steps, say.message)) as logger:
         sinks = RunSinks(config, folder, logger, checkpoints, say, watchers)

@@ -88,12 +88,16 @@ class Checkpoints:
             archive.write(unfinished / STATE, state)
             self._seal(unfinished, step, state, spec)
             unfinished.rename(self._folder / str(step))
-            for old in self.steps()[:-KEPT]:
-                _remove(self._folder / str(old))
+            self.remove_old()
         except (OSError, ValueError) as error:
             shutil.rmtree(unfinished, ignore_errors=True)
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise OSError(f"checkpoint of step {step} cannot be written: {reason}") from error
+
+    def remove_old(self) -> None:
+        """Remove all checkpoints but the newest ones, of which the newest must be whole."""
+        for old in self.steps()[:-KEPT]:
+            _remove(self._folder / str(old))
 
     def remove_unfinished(self) -> None:
         """Remove what a process that was killed did not finish writing or removing."""
