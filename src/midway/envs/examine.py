@@ -78,9 +78,9 @@ def examine(
     own = isinstance(env, Declaration) or (isinstance(env, str) and env in registry.ENVIRONMENTS)
     try:
         declared = registry.entry(env if own else describe(env, settings, **source))
+        made = declared.factory(num_envs)
     except ConfigurationError as error:
         return [("wrong", str(error), False)]
-    made = declared.factory(num_envs)
     spec, foreign = made.goal_spec, declared.foreign
     findings = [
         ("environment", declared.name, True),
