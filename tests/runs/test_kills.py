@@ -24,7 +24,7 @@ def test_no_state_is_said_to_be_what_it_is_not(traced: tuple[Path, Path]) -> Non
         kills.check_state(whole, state)
 
 
-@pytest.mark.parametrize("part", [0.02, 0.1, 0.33, 0.5, 0.75])
+@pytest.mark.parametrize("part", [0.02, 0.1, 0.33, 0.5, 0.75, 0.95])
 def test_a_run_that_is_killed_goes_on(
     traced: tuple[Path, Path], tmp_path: Path, part: float
 ) -> None:
