@@ -71,6 +71,9 @@ FIGURES = {
         "ant-u-learning-curves",
         "benchmarks/figures/ant-u-fast.png",
     ),
+    "ant-mazes": Source(
+        ("ant-u-fast/*", "ant-mazes/*"), "all-learning-curves", "benchmarks/figures/ant-mazes.png"
+    ),
     "push-state": Source(
         ("push-state/*",), "push-state-learning-curves", "benchmarks/figures/push-state.png"
     ),
