@@ -317,6 +317,33 @@ QUICK: tuple[Rule, ...] = (
     ),
     Rule(
         "quick",
+        {
+            "clip_targets": True,
+            "unreached_goals": True,
+            "num_critics": 1,
+            "layer_norm": True,
+            "policy_every": 2,
+        },
+        "as on ant-u, seen on push-state",
+        env="push-state",
+        agent="ris sac",
+    ),
+    Rule(
+        "quick",
+        {"num_envs": 16, "updates_per_step": 0.5, "goal_inputs": "relative"},
+        "trials of push-state: fewer updates, steps are cheap",
+        env="push-state",
+        agent="ris sac",
+    ),
+    Rule(
+        "quick",
+        {"num_subgoals": 4, "subgoal_every": 4, "advantage_temperature": 2.0},
+        "as on ant-u, seen on push-state",
+        env="push-state",
+        agent="ris",
+    ),
+    Rule(
+        "quick",
         {"subgoal_learning_rate": 1e-3},
         "curves of the point mazes: fewer updates than the paper",
         env="point-*",
