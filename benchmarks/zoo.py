@@ -2,9 +2,9 @@
 
     python benchmarks/zoo.py RUN...
 
-Each becomes ``zoo/ENV-AGENT``: a run folder without checkpoints, which ``midway evaluate``,
-``watch``, ``report`` and ``midway.load("zoo:ENV-AGENT")`` read like any other. Its card is
-``README.md``.
+Each becomes ``zoo/ENV-AGENT`` with the best policy of the run, or the last where none was confirmed
+as the best: a run folder without checkpoints, which ``midway evaluate``, ``watch``, ``report`` and
+``midway.load("zoo:ENV-AGENT")`` read like any other. Its card is ``README.md``.
 """
 
 import argparse
@@ -13,11 +13,13 @@ import shutil
 from pathlib import Path
 
 from midway import api, reports
-from midway.runs.folder import ZOO, RunFolder, read_json
+from midway.runs import kept
+from midway.runs.folder import ZOO, RunFolder, read_json, write_json
 from midway.statistics import of_policy
+from midway.training.arrays import said_of
 from midway.training.evaluate import ActionKind
 
-KEPT = ("config.json", "metrics.csv", "evaluation.csv", "policy.json", "policy.safetensors")
+KEPT = ("config.json", "metrics.csv", "evaluation.csv")
 EPISODES = 500
 SEED = 1_000
 """Of starts and goals: training evaluates on others."""
@@ -40,12 +42,17 @@ def add(run: RunFolder) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for name in KEPT:
         shutil.copy(run.path / name, folder / name)
+    shown = RunFolder(folder)
+    weights = kept.weights_of(run, "best" if kept.best(run) else "last")
+    shutil.copy(weights, shown.policy_weights)
+    step = said_of(weights)["step"]
+    write_json(shown.policy_config, {**read_json(run.policy_config), "step": step})
     known = config.declaration().tasks
     tasks = [task for task in ("hard", "uniform") if task in known]
     found = [measure(folder, task, actions) for task in tasks for actions in ACTIONS]
     (folder / "evaluation.json").write_text(json.dumps(found, indent=2) + "\n")
     reports.watch(folder, folder / f"{tasks[0]}.mp4", task=tasks[0])
-    (folder / "README.md").write_text(card(RunFolder(folder), found))
+    (folder / "README.md").write_text(card(shown, found))
     return folder
 
 
