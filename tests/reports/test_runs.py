@@ -11,7 +11,7 @@ from midway.errors import ConfigurationError
 from midway.reports import report
 from midway.reports.cache import Study
 from midway.reports.recordings import record
-from midway.reports.runs import groups, read
+from midway.reports.runs import groups, read, seeds_of
 from midway.tables import read as read_table
 
 
@@ -98,6 +98,14 @@ def test_seeds_are_one_group_and_settings_another(ris_run, sac_run):
     assert [r.config.seed for r in found[0].runs] == [0, 1]
     assert len({group.colour for group in found}) == 3
     assert len({group.marker for group in found}) == 3
+
+
+def test_legends_count_the_seeds_of_every_environment(ris_run):
+    run = read(ris_run)
+    (one,) = groups([run])
+    (three,) = groups([with_config(run, seed=seed) for seed in range(3)])
+    assert [seeds_of([one]), seeds_of([three, three])] == ["1 seed", "3 seeds"]
+    assert seeds_of([three, one]) == "1 to 3 seeds"
 
 
 def test_runs_of_different_length_are_one_group(ris_run):

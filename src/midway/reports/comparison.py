@@ -16,7 +16,7 @@ from midway.errors import ConfigurationError
 from midway.reports import style
 from midway.reports.cache import Cache
 from midway.reports.curves import SUCCESS, TASKS
-from midway.reports.runs import Group, RunData, Runs, groups, read
+from midway.reports.runs import Group, RunData, Runs, groups, read, seeds_of
 from midway.reports.style import Picture
 from midway.statistics import Estimate, Scores, improvement, of_runs, performance_profile
 
@@ -181,7 +181,7 @@ def _room(axes: Axes, rows: int) -> None:
 
 
 def _entry(group: Group) -> Line2D:
-    label = f"{group.label} ({group.seeds})"
+    label = f"{group.label} ({seeds_of([group])})"
     return Line2D([], [], color=group.colour, marker=group.marker, linewidth=2, label=label)
 
 

@@ -14,7 +14,7 @@ from midway.envs.push import GOAL_THRESHOLD
 from midway.envs.views import TableView
 from midway.reports import style
 from midway.reports.cache import Cache
-from midway.reports.runs import Group, Runs
+from midway.reports.runs import Group, Runs, seeds_of
 from midway.reports.style import Picture, thousands
 from midway.statistics import Curve, Series, curve
 from midway.tables import Table
@@ -144,8 +144,7 @@ def draw_overview(environments: Sequence[Runs]) -> Figure:
         panel.xaxis.set_major_locator(MaxNLocator(4))
         panel.xaxis.set_major_formatter(thousands)
         panel.label_outer()
-    groups_of_labels = {g.label: g for runs in environments for g in runs.groups}
-    style.legend_below(figure, _group_entries(list(groups_of_labels.values())))
+    style.legend_below(figure, _group_entries([g for runs in environments for g in runs.groups]))
     return figure
 
 
@@ -298,9 +297,13 @@ def _draw_curve(
 
 
 def _group_entries(groups: Sequence[Group]) -> list[Line2D]:
+    """Return an entry for each label, with how many seeds there are of it."""
+    of_label: dict[str, list[Group]] = {}
+    for group in groups:
+        of_label.setdefault(group.label, []).append(group)
     return [
-        _line(group.colour, f"{group.label} ({group.seeds})", marker=group.marker, markersize=5)
-        for group in groups
+        _line(same[0].colour, f"{label} ({seeds_of(same)})", marker=same[0].marker, markersize=5)
+        for label, same in of_label.items()
     ]
 
 

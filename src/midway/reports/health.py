@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from midway.reports import style
 from midway.reports.cache import Cache
-from midway.reports.runs import Group, RunData, Runs
+from midway.reports.runs import Group, RunData, Runs, seeds_of
 from midway.reports.style import Picture, thousands
 from midway.tables import Table
 
@@ -217,4 +217,6 @@ def _write(axes: Axes, panel: Panel) -> None:
 
 
 def _entry(group: Group) -> Line2D:
-    return Line2D([], [], color=group.colour, linewidth=2, label=f"{group.label} ({group.seeds})")
+    return Line2D(
+        [], [], color=group.colour, linewidth=2, label=f"{group.label} ({seeds_of([group])})"
+    )

@@ -163,10 +163,12 @@ class Group:
     marker: str
     runs: tuple[RunData, ...]
 
-    @property
-    def seeds(self) -> str:
-        """How many runs there are, in words."""
-        return "1 seed" if len(self.runs) == 1 else f"{len(self.runs)} seeds"
+
+def seeds_of(groups: Sequence[Group]) -> str:
+    """Return how many runs each group has, in words: of the smallest to the largest."""
+    counts = sorted({len(group.runs) for group in groups})
+    numbers = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
+    return f"{numbers} seed{'s' * (counts[-1] > 1)}"
 
 
 @dataclass(frozen=True)
