@@ -71,6 +71,15 @@ FIGURES = {
         "ant-u-learning-curves",
         "benchmarks/figures/ant-u-fast.png",
     ),
+    **{
+        f"ant-pi-{what}": Source(
+            ("ant-pi-ris-seed0",),
+            f"ant-pi-ris-{what}",
+            f"benchmarks/figures/ant-pi-{what}.png",
+            True,
+        )
+        for what in ("values", "subgoals")
+    },
     "ant-mazes": Source(
         ("ant-u-fast/*", "ant-mazes/*"), "all-learning-curves", "benchmarks/figures/ant-mazes.png"
     ),
