@@ -22,7 +22,7 @@ RESULTS = Path(__file__).parent / "results"
 KEPT = ("evaluation.csv", "metrics.csv", "config.json")
 
 POINT_MAZES = ("point-u", "point-s", "point-pi", "point-omega")
-LONG_WAYS = ("ant-s", "ant-pi", "ant-omega")
+ANT_MAZES = ("ant-u", "ant-s", "ant-pi", "ant-omega")
 SEEDS = range(5)
 F32 = ("--precision", "f32")
 BF16 = ("--precision", "bf16")
@@ -59,14 +59,10 @@ SUITES: dict[str, list[Job]] = {
     "push": [Job("push", "ris", 0)],
     "push-f32": [Job("push", "ris", 0, F32)],
     "precision": [Job("point-u", "ris", seed, F32, "f32") for seed in SEEDS],
-    "ant-u-fast": [
-        *(Job("ant-u", "ris", seed) for seed in range(3)),
-        Job("ant-u", "sac", 0),
-    ],
     "ant-mazes": [
-        *(Job(env, "ris", seed) for seed in range(3) for env in LONG_WAYS),
-        *(Job(env, agent, 0) for env in LONG_WAYS for agent in ("sac", "leap")),
-        *(Job("ant-u", agent, 0) for agent in ("leap", "tdm")),
+        *(Job(env, "ris", seed) for seed in range(3) for env in ANT_MAZES),
+        *(Job(env, agent, 0) for agent in ("sac", "leap") for env in ANT_MAZES),
+        Job("ant-u", "tdm", 0),
     ],
     "arm": [
         *(Job("push", "ris", seed) for seed in range(3)),

@@ -1,6 +1,7 @@
-"""Print a table of the results of a suite, one row for each environment, agent and variant of it.
+"""Print one table of the results of suites, a row for each environment, agent and variant of it.
 
     python benchmarks/summary.py benchmarks/results/point-mazes
+    python benchmarks/summary.py benchmarks/results/ant-u-fast benchmarks/results/ant-mazes
 
 Success is that of the last evaluation of each seed: of one, or the interquartile mean of several,
 with the 95 % interval, which counts episodes and seeds (``midway.statistics``). Steps and minutes
@@ -12,6 +13,7 @@ import argparse
 import csv
 import json
 from collections import defaultdict
+from itertools import chain
 from pathlib import Path
 
 from midway.statistics import of_agent
@@ -22,9 +24,10 @@ Rows = list[dict[str, str]]
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("suite", type=Path, help="folder of results")
+    parser.add_argument("suites", type=Path, nargs="+", help="folders of results")
     groups: dict[tuple[str, str, str], list[Rows]] = defaultdict(list)
-    for folder in sorted(parser.parse_args().suite.iterdir()):
+    suites: list[Path] = parser.parse_args().suites
+    for folder in chain.from_iterable(sorted(suite.iterdir()) for suite in suites):
         config = json.loads((folder / "config.json").read_text())
         with (folder / "evaluation.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))

@@ -108,7 +108,7 @@ ENVIRONMENTS: dict[str, Declaration] = {
     declared.name: declared
     for declared in [
         *_in_mazes("point", "point mass", POINT, None, [32_000, 32_000, 32_000, 48_000]),
-        *_in_mazes("ant", "four-legged ant", ANT, (5, 7), 4 * [300_000]),
+        *_in_mazes("ant", "four-legged ant", ANT, (5, 7), [160_000, 240_000, 240_000, 400_000]),
         _push("push", "midway/Push-v0", IMAGES, "PushVectorEnv", 400_000),
         _push("push-state", "midway/PushState-v0", STATES, "PushStateVectorEnv", 60_000),
     ]
@@ -119,7 +119,8 @@ ENVIRONMENTS: dict[str, Declaration] = {
 def own_maze(robot: str, layout: "Layout") -> Declaration:
     """Return the declaration of a robot in a maze of one's own.
 
-    Episodes and budget are those of the U-shaped maze, and grow with the way of the hard task.
+    Episodes are those of the U-shaped maze, the budget is that of the Π-shaped one, which is harder
+    to learn; both grow with the way of the hard task.
 
     Args:
         robot: ``point`` or ``ant``.
@@ -141,7 +142,7 @@ def own_maze(robot: str, layout: "Layout") -> Declaration:
         entry_point=entry_point,
         arguments={"maze": maze, "max_episode_steps": 10 * round(limit * longer / 10)},
         view=MazeView(maze, upright),
-        steps=1_000 * round(ENVIRONMENTS[f"{robot}-u"].steps * longer / 1_000),
+        steps=1_000 * round(ENVIRONMENTS[f"{robot}-pi"].steps * longer / 1_000),
         layout=layout,
     )
 
