@@ -163,7 +163,8 @@ class Agent(Generic[ConfigT, StateT]):
         update: ``(state, batch, key) -> (state, metrics)``: one gradient step of every network.
         act: ``(state, observation, goal, key, explore) -> actions (B, A)`` in [-1, 1]: sampled
             where ``explore``, else deterministic; with a memory, those of an episode's first step.
-        networks: Parts of the state that a saved policy holds.
+        networks: Parts of the state that a saved policy holds: what acts and what reports read. No
+            target networks.
         value: Its estimate of V(s, g), if it has one.
         subgoals: ``(state, observation, goal) -> SubgoalDistribution``, if it imagines subgoals.
         memory: What it remembers of an episode, if anything.

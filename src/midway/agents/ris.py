@@ -289,7 +289,7 @@ AGENT = Agent(
     create,
     update,
     act,
-    networks=("encoder", "critic", "target_critic", "subgoal_policy", "policy", "prior_policy"),
+    networks=("encoder", "critic", "subgoal_policy", "policy"),
     value=Value(encoders.on_observations(value), "value: minus discounted steps to the goal"),
     subgoals=subgoal_distribution,
     sampling=beyond.sampling,

@@ -183,7 +183,7 @@ AGENT = Agent(
     create,
     update,
     act,
-    networks=("encoder", "critic", "target_critic", "policy"),
+    networks=("encoder", "critic", "policy"),
     value=Value(encoders.on_observations(value), "value: minus discounted steps to the goal"),
     sampling=beyond.sampling,
     freezing=Freezing(lambda state: state.encoder),

@@ -313,7 +313,7 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
     )
 
 
-NETWORKS = ("encoder", "critic", "target_critic", "policy", "target_policy")
+NETWORKS = ("encoder", "critic", "policy")
 
 AGENT = Agent(
     Config,
