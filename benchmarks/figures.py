@@ -73,7 +73,7 @@ FIGURES = {
     ),
     **{
         f"ant-pi-{what}": Source(
-            ("ant-pi-ris-seed0",),
+            ("ant-pi-ris-discount-0.99",),
             f"ant-pi-ris-{what}",
             f"benchmarks/figures/ant-pi-{what}.png",
             True,
@@ -81,7 +81,13 @@ FIGURES = {
         for what in ("values", "subgoals")
     },
     "ant-mazes": Source(
-        ("ant-u-fast/*", "ant-mazes/*"), "all-learning-curves", "benchmarks/figures/ant-mazes.png"
+        ("ant-mazes/*",), "all-learning-curves", "benchmarks/figures/ant-mazes.png"
+    ),
+    "ant-omega-subgoals": Source(
+        ("ant-omega-ris-seed0",),
+        "ant-omega-ris-subgoals",
+        "benchmarks/figures/ant-omega-subgoals.png",
+        True,
     ),
     "push-state": Source(
         ("push-state/*",), "push-state-learning-curves", "benchmarks/figures/push-state.png"

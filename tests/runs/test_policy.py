@@ -15,6 +15,7 @@ from midway.envs import registry
 from midway.envs.push import IMAGE_SPEC, STATE_SPEC
 from midway.errors import ConfigurationError
 from midway.runs.folder import FORMAT, RunConfig, RunFolder
+from midway.training.arrays import checked_arrays, save_arrays
 from midway.types import EnvSpec, UnknownTask
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
@@ -49,6 +50,21 @@ def test_a_policy_loads_without_an_environment(
     (run.path / "policy.json").write_text(json.dumps(later))
     with pytest.raises(ConfigurationError, match=f"format {FORMAT + 1}, expected 1 to {FORMAT}"):
         midway.load(run.path)
+
+
+def test_target_networks_are_not_saved_and_do_no_harm_where_they_were(tmp_path: Path) -> None:
+    run = midway.train("point-u", agent="ris", out=tmp_path / "run", changes=TINY)
+    zeros = np.zeros((3, 4), np.float32)
+    action, value = midway.load(run.path)(zeros, zeros), midway.load(run.path).value(zeros, zeros)
+    file = RunFolder(run.path).policy_weights
+    held, said = checked_arrays(file)
+    parts = {name.split(".")[0] for name in held}
+    assert parts == {"critic", "subgoal_policy", "policy"}
+    copies = {f"target_{name}": array for name, array in held.items() if name.startswith("critic")}
+    save_arrays(file, held | copies, {name: said[name] for name in ("run", "step")})
+    before = midway.load(run.path)
+    np.testing.assert_array_equal(before(zeros, zeros), action)
+    np.testing.assert_array_equal(before.value(zeros, zeros), value)
 
 
 SPECS = [
