@@ -37,6 +37,9 @@ class Settings:
     normalise: bool = setting(False, "none", "states by the environment's center and spread")
     goal_inputs: GoalInputs = setting("whole", "none", "of the networks", choices=GOAL_INPUTS)
     policy_every: int = setting(1, "code of RIS", "updates for each of the policy", least=1)
+    halve_rates_after: int = setting(
+        0, "none", "updates of a network that halve its learning rate; 0: none do", least=0
+    )
     network: str = setting("", "none", "module:function that makes networks; nothing: an MLP")
     failure_cost: float = setting(1.0, "ours", "of a failed episode, times 1 / (1 - γ)", least=0)
 

@@ -42,7 +42,7 @@ def step_policy_and_coefficient(
         policy_loss,
         agent.policy,
         agent.policy_optimizer,
-        rates.policy_learning_rate,
+        optimizer.decayed(rates.policy_learning_rate, rates, agent.policy_optimizer),
         state,
         *inputs,
     )

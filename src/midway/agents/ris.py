@@ -201,7 +201,8 @@ def update_critic(
 
 def update_subgoal_policy(state: State, batch: Batch) -> tuple[State, Metrics]:
     """Step the subgoal policy towards good candidates."""
-    old, rate = (state.subgoal_policy, state.subgoal_optimizer), state.config.subgoal_learning_rate
+    config, old = state.config, (state.subgoal_policy, state.subgoal_optimizer)
+    rate = optimizer.decayed(config.subgoal_learning_rate, config, old[1])
     network, adam, metrics = optimizer.minimise(subgoal_loss, *old, rate, state, batch)
     return replace(state, subgoal_policy=network, subgoal_optimizer=adam), metrics
 
@@ -212,7 +213,8 @@ def update_policy(
     """Step the policy against the value and the prior of imagined subgoals."""
     imagined = imagine(state, batch, subgoal_key).achieved_goal
     noise = jax.random.normal(action_key, batch.action.shape)
-    old, rate = (state.policy, state.policy_optimizer), state.config.policy_learning_rate
+    config, old = state.config, (state.policy, state.policy_optimizer)
+    rate = optimizer.decayed(config.policy_learning_rate, config, old[1])
     inputs = (state, batch, noise, imagined)
     network, adam, metrics = optimizer.minimise(policy_loss, *old, rate, *inputs)
     return replace(state, policy=network, policy_optimizer=adam), metrics

@@ -2,15 +2,26 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import equinox as eqx
 import optax
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 Network = TypeVar("Network", bound=PyTree)
 State = TypeVar("State")
 Others = TypeVar("Others")
+Rate: TypeAlias = float | Float[Array, ""]
+"""A learning rate: fixed, or decayed."""
+
+
+@runtime_checkable
+class Decaying(Protocol):
+    """Settings of an agent whose learning rates may decay."""
+
+    @property
+    def halve_rates_after(self) -> int:
+        """N of `decayed`."""
 
 
 def init(network: PyTree) -> optax.OptState:
@@ -19,7 +30,7 @@ def init(network: PyTree) -> optax.OptState:
 
 
 def step(
-    network: Network, gradient: PyTree, state: optax.OptState, learning_rate: float
+    network: Network, gradient: PyTree, state: optax.OptState, learning_rate: Rate
 ) -> tuple[Network, optax.OptState]:
     """Return the network after one step of Adam against the gradient, and Adam's new state."""
     updates, state = optax.adam(learning_rate).update(gradient, state)
@@ -30,7 +41,7 @@ def minimise(
     loss: Callable[..., tuple[Array, Others]],
     network: Network,
     state: optax.OptState,
-    learning_rate: float,
+    learning_rate: Rate,
     *inputs: object,
 ) -> tuple[Network, optax.OptState, Others]:
     """Return the network after one step of Adam, Adam's new state, and what else the loss gives."""
@@ -52,11 +63,10 @@ def step_critic_and_encoder(
     agent: Any = state
     gradient_of = eqx.filter_value_and_grad(loss, has_aux=True)
     (_, others), gradients = gradient_of((agent.critic, agent.encoder), *inputs)
-    rates = agent.config
-    critic = step(agent.critic, gradients[0], agent.critic_optimizer, rates.critic_learning_rate)
-    encoder = step(
-        agent.encoder, gradients[1], agent.encoder_optimizer, rates.encoder_learning_rate
-    )
+    config, adam = agent.config, (agent.critic_optimizer, agent.encoder_optimizer)
+    rate = decayed(config.critic_learning_rate, config, adam[0])
+    critic = step(agent.critic, gradients[0], adam[0], rate)
+    encoder = step(agent.encoder, gradients[1], adam[1], config.encoder_learning_rate)
     return replace(
         agent,
         critic=critic[0],
@@ -64,6 +74,19 @@ def step_critic_and_encoder(
         encoder=encoder[0],
         encoder_optimizer=encoder[1],
     ), others
+
+
+def decayed(rate: float, config: object, state: optax.OptState) -> Rate:
+    """Return η / (1 + t / N) after t updates of a network: inverse-time decay.
+
+    Args:
+        rate: η, the rate of the first update.
+        config: The agent's settings, with N; the rate stays what it is with N = 0 or without N.
+        state: The network's Adam, which counts t.
+    """
+    if not isinstance(config, Decaying) or config.halve_rates_after == 0:
+        return rate
+    return rate / (1 + updates(state) / config.halve_rates_after)
 
 
 def updates(state: optax.OptState) -> Int[Array, ""]:
