@@ -155,3 +155,25 @@ def test_delayed_policies_step_in_every_second_update(module):
     assert same(second.policy, first.policy)
     assert not same(second.critic, first.critic)
     assert all(np.isfinite(float(value)) for value in metrics.values())
+
+
+@pytest.mark.parametrize("agent", [ris, sac])
+def test_learning_rates_of_each_network_halve_after_as_many_of_its_updates(agent):
+    """The second step of critics and policies is half as long with N = 1."""
+    config = agent.Config(hidden=(8,))
+    first, _ = agent.update(agent.create(config, SPEC, KEY), batch(), KEY)
+    decaying = replace(first, config=replace(config, halve_rates_after=1))
+    steps = {"critic": agent.update_critic, "policy": agent.update_policy}
+    if agent is ris:
+        steps["subgoal_policy"] = agent.update_subgoal_policy
+    for name, step in steps.items():
+        keys = {"critic": (batch().observation, batch(), KEY), "subgoal_policy": (batch(),)}
+        keys["policy"] = (batch(), KEY, KEY) if agent is ris else (batch(), KEY)
+
+        def moved(state, name=name, step=step, inputs=keys):
+            after = step(state, *inputs[name])[0]
+            before, after = (jax.tree.leaves(getattr(x, name)) for x in (state, after))
+            return [new - old for old, new in zip(before, after, strict=True)]
+
+        for whole, half in zip(moved(first), moved(decaying), strict=True):
+            np.testing.assert_allclose(half, whole / 2, atol=1e-7)
