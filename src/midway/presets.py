@@ -283,6 +283,13 @@ QUICK: tuple[Rule, ...] = (
     ),
     Rule(
         "quick",
+        {"halve_rates_after": 50_000},
+        "trials of ant-pi: with fixed rates success comes and goes",
+        env="ant-pi ant-omega",
+        agent="ris sac",
+    ),
+    Rule(
+        "quick",
         {
             "num_envs": 8,
             "random_steps": 10_000,
