@@ -84,7 +84,7 @@ FIGURES = {
         ("ant-mazes/*",), "all-learning-curves", "benchmarks/figures/ant-mazes.png"
     ),
     "ant-omega-subgoals": Source(
-        ("ant-omega-ris-seed0",),
+        ("ant-omega-ris-seed1",),
         "ant-omega-ris-subgoals",
         "benchmarks/figures/ant-omega-subgoals.png",
         True,
