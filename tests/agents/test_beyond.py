@@ -163,15 +163,17 @@ def test_learning_rates_of_each_network_halve_after_as_many_of_its_updates(agent
     config = agent.Config(hidden=(8,))
     first, _ = agent.update(agent.create(config, SPEC, KEY), batch(), KEY)
     decaying = replace(first, config=replace(config, halve_rates_after=1))
-    steps = {"critic": agent.update_critic, "policy": agent.update_policy}
+    keys = (KEY, KEY) if agent is ris else (KEY,)
+    steps = {
+        "critic": (agent.update_critic, batch().observation, batch(), KEY),
+        "policy": (agent.update_policy, batch(), *keys),
+    }
     if agent is ris:
-        steps["subgoal_policy"] = agent.update_subgoal_policy
-    for name, step in steps.items():
-        keys = {"critic": (batch().observation, batch(), KEY), "subgoal_policy": (batch(),)}
-        keys["policy"] = (batch(), KEY, KEY) if agent is ris else (batch(), KEY)
+        steps["subgoal_policy"] = (agent.update_subgoal_policy, batch())
+    for name, (step, *given) in steps.items():
 
-        def moved(state, name=name, step=step, inputs=keys):
-            after = step(state, *inputs[name])[0]
+        def moved(state, name=name, step=step, given=given):
+            after = step(state, *given)[0]
             before, after = (jax.tree.leaves(getattr(x, name)) for x in (state, after))
             return [new - old for old, new in zip(before, after, strict=True)]
 
