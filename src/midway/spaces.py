@@ -51,7 +51,7 @@ SPACE: Space = {
     "subgoal_learning_rate": Range(1e-4, 3e-3, log=True),
     "target_update_rate": Range(1e-3, 3e-2, log=True),
     "kl_weight": Range(0.02, 1.0, log=True),
-    "advantage_temperature": Range(0.05, 3.0, log=True),
+    "advantage_temperature": Range(0.05, 10.0, log=True),
     "n_step": Choice((1, 3, 5)),
     "clip_targets": Choice((False, True)),
     "layer_norm": Choice((False, True)),

@@ -203,10 +203,11 @@ def test_a_process_is_ended_once_when_asked(
 
 
 def test_spaces_hold_the_values_of_the_preset_and_what_the_agent_has(tmp_path: Path) -> None:
-    ris, sac = presets.resolve("ant-u", "ris"), presets.resolve("ant-u", "sac")
+    ris = presets.resolve("ant-u", "ris", changes={"kl_weight": 0.1, "batch_size": 256})
+    sac = presets.resolve("ant-u", "sac")
     space = spaces.of(ris[:2])
     assert space["n_step"] == Choice((1, 3, 5))
-    assert space["advantage_temperature"] == Range(0.05, 3.0, log=True)
+    assert space["advantage_temperature"] == Range(0.05, 10.0, log=True)
     assert "kl_weight" not in spaces.of(sac[:2])
     file = tmp_path / "space.toml"
     file.write_text("kl_weight = {low = 0.5, high = 1.0, log = true}\nbatch_size = [64, 128]\n")
