@@ -3,8 +3,9 @@
     python benchmarks/figures.py point-mazes
     python benchmarks/figures.py point-u-subgoals --runs DIR
 
-Curves come from the CSV files in ``benchmarks/results``. What a policy does or imagines needs the
-run folders themselves: ``--runs`` is the folder that ``benchmarks/run.py`` was given.
+Curves come from the CSV files in ``benchmarks/results``, success by difficulty from the policies
+in ``zoo``. What was imagined during training needs the run folders themselves: ``--runs`` is the
+folder that ``benchmarks/run.py`` was given.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from midway.reports import comparison, compose, curves, difficulty, style
 from midway.reports.cache import Cache
 from midway.reports.runs import by_environment, read
 from midway.reports.style import Picture
+from midway.runs.folder import ZOO
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
@@ -29,16 +31,16 @@ class Source:
     """Where a figure comes from.
 
     Attributes:
-        runs: Patterns of run folders, in the results or in the folder of ``--runs``.
+        runs: Patterns of run folders.
         file: Its name in the report of these runs.
         out: Where it goes, in the repository.
-        needs_policies: Whether CSV files are not enough.
+        where: The folder that holds the run folders; None for that of ``--runs``.
     """
 
     runs: tuple[str, ...]
     file: str
     out: str
-    needs_policies: bool = False
+    where: Path | None = RESULTS
 
 
 FIGURES = {
@@ -55,15 +57,15 @@ FIGURES = {
     ),
     **{
         f"{env}-difficulty": Source(
-            (f"{env}-*-seed*",),
+            (f"{env}-*",),
             f"{env}-difficulty",
             f"benchmarks/figures/{env}-difficulty.png",
-            True,
+            ZOO,
         )
         for env in ("point-u", "point-s", "point-omega", "ant-s", "ant-omega")
     },
     "point-u-subgoals": Source(
-        ("point-u-ris-seed0",), "point-u-ris-subgoals", "docs/images/point-u-subgoals.png", True
+        ("point-u-ris-seed0",), "point-u-ris-subgoals", "docs/images/point-u-subgoals.png", None
     ),
     "ant-u": Source(("ant-u/*",), "ant-u-learning-curves", "benchmarks/figures/ant-u.png"),
     "ant-u-fast": Source(
@@ -76,7 +78,7 @@ FIGURES = {
             ("ant-pi-ris-discount-0.99",),
             f"ant-pi-ris-{what}",
             f"benchmarks/figures/ant-pi-{what}.png",
-            True,
+            None,
         )
         for what in ("values", "subgoals")
     },
@@ -87,7 +89,7 @@ FIGURES = {
         ("ant-omega-ris-seed1",),
         "ant-omega-ris-subgoals",
         "benchmarks/figures/ant-omega-subgoals.png",
-        True,
+        None,
     ),
     "push-state": Source(
         ("push-state/*",), "push-state-learning-curves", "benchmarks/figures/push-state.png"
@@ -100,7 +102,7 @@ FIGURES = {
         ("push/*", "push-f32/*"), "push-distances", "benchmarks/figures/push-distances.png"
     ),
     "push-images": Source(
-        ("push-ris-seed0",), "push-ris-images", "benchmarks/figures/push-images.png", True
+        ("push-ris-seed0",), "push-ris-images", "benchmarks/figures/push-images.png", None
     ),
 }
 """Every figure by its name."""
@@ -113,17 +115,17 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, help="folder of the run folders")
     arguments = parser.parse_args()
     source = FIGURES[arguments.figure]
-    if source.needs_policies and arguments.runs is None:
+    folder = source.where or arguments.runs
+    if folder is None:
         sys.exit(f"{arguments.figure} needs policies: give --runs, the folder of the run folders")
-    folder = arguments.runs if source.needs_policies else RESULTS
     runs = sorted(path for pattern in source.runs for path in folder.glob(pattern) if path.is_dir())
     if not runs:
         sys.exit(f"no runs like {', '.join(source.runs)} in {folder}: see benchmarks/README.md")
-    with tempfile.TemporaryDirectory() as folder:
-        picture = find(source.file, runs, Path(folder))
+    with tempfile.TemporaryDirectory() as temporary:
+        picture = find(source.file, runs, Path(temporary))
         if picture is None:
             sys.exit(f"these runs have no {source.file}: see what their report says is missing")
-        files = style.save(picture.draw(), Path(folder) / picture.stem)
+        files = style.save(picture.draw(), Path(temporary) / picture.stem)
         print(shutil.copy(files[0], HERE.parent / source.out))
 
 
