@@ -291,7 +291,7 @@ QUICK: tuple[Rule, ...] = (
     Rule(
         "quick",
         {"halve_rates_after": 150_000},
-        "trials of ant-omega: learned later than ant-pi, too slowly where rates have fallen",
+        "trials of ant-omega: with 50,000 success comes later and does not stay",
         env="ant-omega",
         agent="ris sac",
     ),
