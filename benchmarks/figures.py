@@ -82,8 +82,8 @@ FIGURES = {
         )
         for what in ("values", "subgoals")
     },
-    "ant-mazes": Source(
-        ("ant-mazes/*",), "all-learning-curves", "benchmarks/figures/ant-mazes.png"
+    "paper": Source(
+        ("ant-mazes/*", "arm/*"), "all-learning-curves", "benchmarks/figures/paper.png"
     ),
     "ant-omega-subgoals": Source(
         ("ant-omega-ris-seed1",),
@@ -91,16 +91,15 @@ FIGURES = {
         "benchmarks/figures/ant-omega-subgoals.png",
         None,
     ),
-    "push-state": Source(
-        ("push-state/*",), "push-state-learning-curves", "benchmarks/figures/push-state.png"
-    ),
-    "push-state-distances": Source(
-        ("push-state/*",), "push-state-distances", "benchmarks/figures/push-state-distances.png"
-    ),
-    "push": Source(("push/*", "push-f32/*"), "push-learning-curves", "benchmarks/figures/push.png"),
-    "push-distances": Source(
-        ("push/*", "push-f32/*"), "push-distances", "benchmarks/figures/push-distances.png"
-    ),
+    **{
+        f"{env}{suffix}": Source(
+            tuple(f"arm/{env}-{agent}-seed*" for agent in ("ris", "sac", "leap")),
+            f"{env}-{file}",
+            f"benchmarks/figures/{env}{suffix}.png",
+        )
+        for env in ("push", "push-state")
+        for suffix, file in (("", "learning-curves"), ("-distances", "distances"))
+    },
     "push-images": Source(
         ("push-ris-seed0",), "push-ris-images", "benchmarks/figures/push-images.png", None
     ),

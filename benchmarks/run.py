@@ -55,8 +55,6 @@ SUITES: dict[str, list[Job]] = {
     "point-u-agents": [
         Job("point-u", agent, seed) for agent in ("tdm", "leap", "crl") for seed in range(3)
     ],
-    "push-state": [Job("push-state", agent, 0) for agent in ("ris", "sac")],
-    "push": [Job("push", "ris", 0)],
     "push-f32": [Job("push", "ris", 0, F32)],
     "precision": [Job("point-u", "ris", seed, F32, "f32") for seed in SEEDS],
     "ant-mazes": [

@@ -343,7 +343,6 @@ QUICK: tuple[Rule, ...] = (
         {
             "clip_targets": True,
             "unreached_goals": True,
-            "num_critics": 1,
             "layer_norm": True,
             "policy_every": 2,
         },

@@ -110,7 +110,7 @@ ENVIRONMENTS: dict[str, Declaration] = {
         *_in_mazes("point", "point mass", POINT, None, [32_000, 32_000, 32_000, 48_000]),
         *_in_mazes("ant", "four-legged ant", ANT, (5, 7), [160_000, 240_000, 400_000, 400_000]),
         _push("push", "midway/Push-v0", IMAGES, "PushVectorEnv", 400_000),
-        _push("push-state", "midway/PushState-v0", STATES, "PushStateVectorEnv", 60_000),
+        _push("push-state", "midway/PushState-v0", STATES, "PushStateVectorEnv", 100_000),
     ]
 }
 """Every environment of this package by name, in the order of lists."""

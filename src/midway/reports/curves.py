@@ -141,7 +141,7 @@ def draw_overview(environments: Sequence[Runs]) -> Figure:
     for panel in axes:
         style.success_axis(panel)
         panel.set_xlim(left=0)
-        panel.xaxis.set_major_locator(MaxNLocator(4))
+        panel.xaxis.set_major_locator(MaxNLocator(4 if columns < 6 else 3))
         panel.xaxis.set_major_formatter(thousands)
         panel.label_outer()
     style.legend_below(figure, _group_entries([g for runs in environments for g in runs.groups]))
