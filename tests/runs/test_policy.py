@@ -99,8 +99,7 @@ def test_specifications_that_are_not_understood_are_refused(values: dict[str, An
 COMMITTED = [
     path
     for path in sorted(RESULTS.glob("*/*/config.json"))
-    if json.loads(path.read_text()).get("format") == 1
-    and path.parts[-3] != "ant-u-fast-trials"
+    if json.loads(path.read_text()).get("format") == 1 and path.parts[-3] != "ant-u-fast-trials"
 ]
 
 
