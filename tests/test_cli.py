@@ -165,6 +165,8 @@ def test_bench_prints_figures_with_the_machine(capsys: pytest.CaptureFixture[str
         (["train", "point-u", "--stop-at", "95"], "stop_at 95"),
         (["train", "point-u", "--overwrite", "--out", "/proc/self"], "/proc/self"),
         (["train", "point-u", "--precision", "f16"], "f16"),
+        (["train", "point-u", "--seed", "1", "--seed", "2"], "--seed is given twice"),
+        (["sweep", "point-u", "--seeds", "0", "--seeds=1"], "--seeds is given twice"),
         (["train", "point-u", "--set", "batch"], "batch"),
         (["train", "point-u", "--set", "batches=3"], "batches"),
         (["train", "point-u", "--set", "batch_size=many"], "many"),
@@ -188,6 +190,22 @@ def test_wrong_use_is_one_clear_line_and_status_2(
     assert err.startswith("midway: ")
     assert err.count("\n") == 1
     assert named in err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--set", "batch_size=7", "layer_norm=true"],
+        ["--set", "batch_size=7", "--set", "layer_norm=true"],
+    ],
+)
+def test_settings_follow_one_set_or_one_each(
+    capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    status, out, _ = run(capsys, "presets", "point-u", "sac", *words)
+    given = [line.split()[:2] for line in out.splitlines() if line.rstrip().endswith("given")]
+    assert status == 0
+    assert given == [["batch_size", "7"], ["layer_norm", "True"]]
 
 
 def test_full_disk_fails_in_one_line_and_keeps_the_last_checkpoint(

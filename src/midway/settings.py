@@ -126,7 +126,8 @@ def changed(config: Config, changes: Mapping[str, object]) -> Config:
 
     Args:
         config: A frozen dataclass of settings.
-        changes: Values by name; text is read as a Python literal, lists stand for tuples.
+        changes: Values by name; text is read as a Python literal (or true, false), lists stand for
+            tuples.
 
     Raises:
         ConfigurationError: A name is unknown, or a value has the wrong type or is not allowed.
@@ -155,6 +156,7 @@ def split(
 def _converted(name: str, old: object, value: object) -> object:
     """Return the value in the type of the old one."""
     if isinstance(value, str) and not isinstance(old, str):
+        value = {"true": "True", "false": "False"}.get(value, value)
         try:
             value = ast.literal_eval(value)
         except (ValueError, SyntaxError):

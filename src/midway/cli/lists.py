@@ -7,7 +7,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from midway.cli.about import NOTHING, AboutEnv
-from midway.cli.parsing import plain, print_json, settings
+from midway.cli.parsing import Changes, plain, print_json, settings
 
 
 def envs(json: bool = False) -> None:
@@ -52,7 +52,7 @@ def presets(
     env: Positional[str] = "ant-u",
     agent: Positional[str] = "ris",
     preset: str = "quick",
-    set: tuple[str, ...] = (),
+    set: Changes = (),
     json: bool = False,
     about: AboutEnv = NOTHING,
 ) -> None:

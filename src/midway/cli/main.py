@@ -15,7 +15,16 @@ from midway.cli.about import NOTHING, AboutEnv
 from midway.cli.compare import compare
 from midway.cli.lists import doctor, envs, presets, runs
 from midway.cli.measure import bench, check
-from midway.cli.parsing import Count, Kept, OptionalCount, parse, print_json, run_folders, settings
+from midway.cli.parsing import (
+    Changes,
+    Count,
+    Kept,
+    OptionalCount,
+    parse,
+    print_json,
+    run_folders,
+    settings,
+)
 from midway.cli.saved import export, pull, push
 from midway.cli.tuning import tune
 from midway.errors import BrokenEnvironmentError, ConfigurationError, NonFiniteError
@@ -45,7 +54,7 @@ def train(
     stop_at: float | None = None,
     overwrite: bool = False,
     wandb: str | None = None,
-    set: tuple[str, ...] = (),
+    set: Changes = (),
     about: AboutEnv = NOTHING,
 ) -> None:
     """Train an agent on an environment and write a run folder.
@@ -143,7 +152,7 @@ def evaluate(
     actions: Literal["mean", "sampled"] = "mean",
     seed: int = 0,
     policy: Kept = "last",
-    set: tuple[str, ...] = (),
+    set: Changes = (),
     json: bool = False,
 ) -> None:
     """Run episodes of a trained policy and print how many reach their goal.
@@ -202,7 +211,7 @@ def sweep(
     steps: OptionalCount = None,
     out: Path = Path("runs/sweep"),
     ray: str | None = None,
-    set: tuple[str, ...] = (),
+    set: Changes = (),
     about: AboutEnv = NOTHING,
 ) -> None:
     """Train every combination of environments, agents and seeds; typed again, it goes on.
@@ -256,7 +265,7 @@ def report(
     runs: Positional[tuple[Path, ...]],
     out: Path | None = None,
     policy: Kept = "last",
-    set: tuple[str, ...] = (),
+    set: Changes = (),
 ) -> None:
     """Draw figures and one HTML page from run folders.
 
@@ -279,7 +288,7 @@ def watch(
     episodes: Count = 1,
     seed: int = 0,
     policy: Kept = "last",
-    set: tuple[str, ...] = (),
+    set: Changes = (),
     live: bool = False,
 ) -> None:
     """Write a video of the policy with its imagined subgoals, or show it in a window.

@@ -4,8 +4,10 @@ import contextlib
 import dataclasses
 import functools
 import io
+import itertools
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, ParamSpec
@@ -39,6 +41,8 @@ OptionalCount = Annotated[int | None, _NUMBER]
 """A whole number, or what the preset or the run says."""
 Kept = Literal["best", "last"] | Count
 """A policy of a run."""
+Changes = tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]]
+"""Settings as NAME=VALUE: several after one ``--set``, or one ``--set`` for each."""
 
 
 def parse(
@@ -47,8 +51,12 @@ def parse(
     """Return the command with its arguments.
 
     Raises:
-        ConfigurationError: A wrong command or argument.
+        ConfigurationError: A wrong command or argument, or an option that is given twice.
     """
+    options = Counter(word.partition("=")[0] for word in arguments if word.startswith("--"))
+    for option in sorted(options.keys() - {"--set"}):
+        if options[option] > 1:
+            raise ConfigurationError(f"{option} is given twice: write its values after one")
     errors = io.StringIO()
     delayed = {name: _delay(command) for name, command in commands.items()}
     try:
@@ -87,14 +95,14 @@ def _one_line(box: str) -> str:
     return f"{' '.join(text.split())} (see midway --help)"
 
 
-def settings(words: Sequence[str]) -> dict[str, str]:
-    """Return the settings of ``--set NAME=VALUE ...``.
+def settings(given: Sequence[Sequence[str]]) -> dict[str, str]:
+    """Return the settings of ``--set NAME=VALUE ...``, given once or several times.
 
     Raises:
         ConfigurationError: A word without a value.
     """
     changes = {}
-    for word in words:
+    for word in itertools.chain(*given):
         name, equals, value = word.partition("=")
         if not equals:
             raise ConfigurationError(f"--set {word!r}: write NAME=VALUE")

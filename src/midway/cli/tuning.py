@@ -8,7 +8,7 @@ from tyro.conf import Positional
 
 from midway import tables
 from midway.cli.about import NOTHING, AboutEnv
-from midway.cli.parsing import Count, OptionalCount, settings
+from midway.cli.parsing import Changes, Count, OptionalCount, settings
 from midway.errors import ConfigurationError
 from midway.training.terminal import print_line
 
@@ -31,7 +31,7 @@ def tune(
     space: Path | None = None,
     out: Path | None = None,
     ray: str | None = None,
-    set: tuple[str, ...] = (),
+    set: Changes = (),
     about: AboutEnv = NOTHING,
 ) -> None:
     """Look for better settings than a preset's, and write them as a preset file.
