@@ -55,7 +55,9 @@ SUITES: dict[str, list[Job]] = {
     "point-u-agents": [
         Job("point-u", agent, seed) for agent in ("tdm", "leap", "crl") for seed in range(3)
     ],
-    "push-f32": [Job("push", "ris", 0, F32)],
+    "push-f32": [
+        Job("push", "ris", 0, (*F32, "--set", "random_shift=4", "advantage_temperature=0.1"))
+    ],
     "precision": [Job("point-u", "ris", seed, F32, "f32") for seed in SEEDS],
     "ant-mazes": [
         *(Job(env, "ris", seed) for seed in range(3) for env in ANT_MAZES),
