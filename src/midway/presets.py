@@ -334,7 +334,7 @@ QUICK: tuple[Rule, ...] = (
     Rule(
         "quick",
         {"policy_learning_rate": 1e-3, "encoder_learning_rate": 3e-4, "random_shift": 2},
-        "trials of push: 8 pixels are 5.7 cm, more than a goal may be missed by",
+        "trials of push: with shifts of 4 pixels one seed of three learned nothing",
         env="push push-state",
         agent="ris sac",
     ),
