@@ -220,7 +220,7 @@ QUICK: tuple[Rule, ...] = (
         },
         "trials of ant-u: steps are cheaper than updates",
         env="ant-*",
-        agent="ris sac",
+        agent="ris sac tdm leap",
     ),
     Rule(
         "quick",
@@ -380,7 +380,7 @@ QUICK: tuple[Rule, ...] = (
     ),
     Rule("quick", {"relabel": HINDSIGHT_OF_LEAP}, "code of LEAP", agent="tdm leap"),
     Rule("quick", {"evaluate_every": 16_000}, "leap.md: evaluations plan", agent="leap"),
-    Rule("quick", {"evaluate_every": 75_000}, "leap.md", env="ant-*", agent="leap"),
+    Rule("quick", {"evaluate_every": 160_000}, "leap.md", env="ant-*", agent="leap"),
     Rule("quick", {"evaluate_every": 8_000}, "leap.md", env="point-*", agent="leap"),
     Rule(
         "quick",
