@@ -7,9 +7,10 @@ import pytest
 
 import midway
 from midway.errors import ConfigurationError
+from midway.runs import folder
 from midway.runs.folder import ZOO
 
-POLICIES = sorted(folder.parent.name for folder in ZOO.glob("*/policy.json"))
+POLICIES = sorted(found.parent.name for found in ZOO.glob("*/policy.json"))
 EPISODES = 10
 
 
@@ -37,6 +38,18 @@ def test_the_zoo_has_ris_on_an_ant_maze() -> None:
 def test_an_unknown_name_says_which_there_are() -> None:
     with pytest.raises(ConfigurationError, match=r"zoo has .*ant-u-ris"):
         midway.load("zoo:ant-x-ris")
+
+
+def test_a_wheel_finds_the_zoo_of_a_checkout_it_is_used_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = ZOO.parent
+    monkeypatch.setattr(folder, "ZOO", tmp_path / "zoo")
+    monkeypatch.chdir(here)
+    assert midway.load("zoo:ant-u-ris").spec.name == "ant-u"
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigurationError, match="comes with a checkout"):
+        midway.load("zoo:ant-u-ris")
 
 
 def test_a_card_names_its_command_and_commit() -> None:

@@ -151,7 +151,7 @@ def run_name(env: str, agent: str, seed: int) -> str:
 
 
 ZOO = Path(__file__).parents[3] / "zoo"
-"""Trained policies of the repository; a wheel holds none."""
+"""Trained policies of the repository; a wheel holds none, and looks in the working directory."""
 
 
 @dataclass(frozen=True)
@@ -170,11 +170,12 @@ class RunFolder:
         name = str(path).removeprefix("zoo:")
         if name == str(path):
             return cls(Path(path))
-        known = sorted(folder.parent.name for folder in ZOO.glob("*/policy.json"))
+        zoo = ZOO if ZOO.is_dir() else Path("zoo")
+        known = sorted(folder.parent.name for folder in zoo.glob("*/policy.json"))
         if name not in known:
-            there = ", ".join(known) or "nothing: it comes with a checkout"
+            there = ", ".join(known) or "nothing here: it comes with a checkout, run this in one"
             raise ConfigurationError(f"{path}: the zoo has {there}")
-        return cls(ZOO / name)
+        return cls(zoo / name)
 
     @property
     def config_file(self) -> Path:
