@@ -93,34 +93,6 @@ def test_candidates_are_the_features_of_other_observations():
     np.testing.assert_array_equal(candidate.achieved_goal, candidate.observation)
 
 
-def test_whitened_features_are_uncorrelated_and_alike_in_size():
-    encoder = made("ris")[1].encoder
-    rng = np.random.default_rng(1)
-    images = jnp.asarray(rng.integers(0, 256, (400, *IMAGE), np.uint8))
-    # Features of very different size, the last of them one that hardly differs at all.
-    sizes = np.geomspace(10, 0.01, encoders.NUM_FEATURES)
-    encoder = eqx.tree_at(lambda e: e.linear.weight, encoder, encoder.linear.weight * sizes)
-    before = np.asarray(encoder(images))
-    whitened = encoder.whitened(before)
-    after = np.asarray(whitened(images))
-    np.testing.assert_allclose(after.mean(0), 0, atol=1e-3)
-    covariance = np.cov(after, rowvar=False)
-    deviations = np.linalg.svd(before - before.mean(0), compute_uv=False)[::-1] / 399**0.5
-    wanted = np.minimum(deviations / (encoders.SMALLEST_DEVIATION * deviations[-1]), 1)
-    np.testing.assert_allclose(covariance, np.diag(wanted**2), atol=5e-3)
-    assert wanted[0] < 0.1 < 1 == wanted[-1]
-    for left, found in zip(
-        leaves(encoder.convolutions), leaves(whitened.convolutions), strict=True
-    ):
-        assert left is found
-
-
-def test_images_that_are_all_alike_are_whitened_to_finite_features():
-    encoder = made("ris")[1].encoder
-    images = jnp.full((8, *IMAGE), 100, jnp.uint8)
-    np.testing.assert_allclose(encoder.whitened(np.asarray(encoder(images)))(images), 0, atol=1e-2)
-
-
 def test_subgoals_are_imagined_as_features():
     _, state = made("ris")
     features = state.encoder(drawn().observation)

@@ -7,20 +7,16 @@ from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Key, Shaped, UInt8
 
 from midway.errors import ConfigurationError
 from midway.networks.convolution import Filter, in_blocks
 from midway.networks.initialization import with_centre_tap, with_orthogonal_weight
 from midway.networks.mlp import Linear, Precision
-from midway.types import Batch, EnvSpec, NumPyArray, Subgoal
+from midway.types import Batch, EnvSpec, Subgoal
 
 NUM_FEATURES = 16
 """Features of an image (appendix D)."""
-
-SMALLEST_DEVIATION = 0.1
-"""Of the largest; directions in which features differ less are scaled no further."""
 
 LARGEST_FEATURE = 5.0
 """Bound of normalised entries: an ant on its back lies 20 deviations off."""
@@ -141,23 +137,6 @@ class ImageEncoder(eqx.Module):
 
         found: Float[Array, "B 16"] = in_blocks(features, image)
         return found
-
-    def whitened(self, features: Float[NumPyArray, "n 16"]) -> "ImageEncoder":
-        """Return the encoder with these features of its own centred and whitened (PCA).
-
-        Uncorrelated, with mean 0 and deviation 1, less where they hardly differ.
-        """
-        middle = features.mean(0, dtype=np.float64)
-        variances, directions = np.linalg.eigh(np.cov(features, rowvar=False))
-        deviations = np.sqrt(np.maximum(variances, 0.0))
-        smallest = max(SMALLEST_DEVIATION * deviations.max(), 1e-3)
-        turn = directions / np.maximum(deviations, smallest)
-        weight, bias = self.linear.weight, self.linear.bias
-        linear = (weight @ jnp.float32(turn), (bias - jnp.float32(middle)) @ jnp.float32(turn))
-        whitened: ImageEncoder = eqx.tree_at(
-            lambda encoder: (encoder.linear.weight, encoder.linear.bias), self, linear
-        )
-        return whitened
 
     def states(self, features: Float[Array, "*B 16"]) -> Float[Array, "*B 16"]:
         """Return the features: they are not decoded here."""

@@ -1,9 +1,8 @@
 """Freezing the image encoder: from then on a run is one of an ordinary state agent.
 
-Its features are whitened over the replay, which is encoded once; each new image is when it is seen.
-The agent is created anew for them. No update encodes an image any more, and a checkpoint holds
-none. Networks that learned while features moved would keep a policy whose spread can sit at its
-clip, without gradient.
+The replay is encoded once, and each new image when it is seen; the agent is created anew for the
+features. No update encodes an image any more, and a checkpoint holds none. Networks that learned
+while features moved would keep a policy whose spread can sit at its clip, without gradient.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,7 +17,6 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from midway.agent import AnyAgent, Encoder
-from midway.networks.encoder import ImageEncoder
 from midway.replay.storage import ReplayState
 from midway.training.devices import compile_by_lane
 from midway.types import EnvSpec, Info, NumPyArray, Observations, Options, Step, VectorGoalEnv
@@ -33,15 +31,6 @@ def encoded_spec(spec: EnvSpec, encoder: Encoder) -> EnvSpec:
     """Return what an agent of the encoder's features may know of an environment of images."""
     image = jax.ShapeDtypeStruct((1, *spec.observation_shape), jnp.uint8)
     return spec.encoded(eqx.filter_eval_shape(encoder, image).shape[1])
-
-
-def whitened(encoder: Encoder, replay: ReplayState) -> Encoder:
-    """Return an encoder of images with its features whitened over what the replay holds."""
-    if not isinstance(encoder, ImageEncoder):
-        return encoder
-    features = np.asarray(encoded_replay(replay, encoder).rows["observation"])
-    slots = np.arange(features.shape[1])
-    return encoder.whitened(features[slots < np.asarray(replay.written)[:, None]])
 
 
 def encoded_replay(replay: ReplayState, encoder: Encoder) -> ReplayState:

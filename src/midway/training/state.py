@@ -264,8 +264,7 @@ def freeze_encoder(training: Training) -> None:
     setup, freezing = training.setup, training.setup.agent.freezing
     if freezing is None:
         return
-    state = training.state
-    encoder = freeze.whitened(freezing.encoder(state), training.replay)
+    encoder, state = freezing.encoder(training.state), training.state
     fresh = _create(setup, _spec(training.program.spec, encoder))
     _see_features(training, encoder, freeze.keep(setup.agent, fresh, state))
     training.replay = freeze.encoded_replay(training.replay, encoder)
