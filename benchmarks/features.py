@@ -4,7 +4,7 @@
 
 A network learns hand and puck from the features of 2,000 images; how far off it is on 500 others
 says what features hold. How far features move with 3 cm of either says how well it is seen. Writes
-``benchmarks/results/features/ENV-AGENT-seedN.json``.
+``benchmarks/results/features/RUN.json``, named as the run's folder.
 """
 
 import argparse
@@ -39,9 +39,9 @@ def main() -> None:
     RESULTS.mkdir(parents=True, exist_ok=True)
     for run in parser.parse_args().runs:
         folder = RunFolder(run)
-        config, record = folder.load_config(), read_json(folder.config_file)
+        record = read_json(folder.config_file)
         found = {"command": record["command"], "commit": record["commit"], **measure(run)}
-        path = RESULTS / f"{config.env}-{config.agent}-seed{config.seed}.json"
+        path = RESULTS / f"{folder.path.resolve().name}.json"
         path.write_text(json.dumps(found, indent=2) + "\n")
         print(path, {name: found[name] for name in ("hand", "puck")})
 
