@@ -58,3 +58,11 @@ def test_a_card_names_its_command_and_commit() -> None:
         record = json.loads((Path(ZOO) / name / "config.json").read_text())
         assert record["command"] in text
         assert record["commit"] in text
+
+
+def test_the_table_has_every_policy_with_what_its_card_says() -> None:
+    rows = [line for line in (ZOO / "README.md").read_text().splitlines() if ".md)" in line]
+    assert [row.split("]")[0] for row in rows] == [f"| [{name}" for name in POLICIES]
+    for name, row in zip(POLICIES, rows, strict=True):
+        for found in card(name):
+            assert f"{100 * float(str(found['success_rate'])):.1f} [" in row
