@@ -1,14 +1,17 @@
-"""Measure what the frozen encoder of a run on `push` keeps of hand and puck.
+"""Measure what the encoder of a run on `push` keeps of hand and puck.
 
     python benchmarks/features.py RUN...
 
 A network learns hand and puck from the features of 2,000 images; how far off it is on 500 others
-says what features hold. How far features move with 3 cm of either says how well it is seen. Writes
+says what features hold. How far features move with 3 cm of either says how well it is seen. A
+network that learns the value of ``zoo/push-state-ris`` from the features of two images says how
+well critics could do with them; beside it the same from hand and puck themselves. Writes
 ``benchmarks/results/features/RUN.json``, named as the run's folder.
 """
 
 import argparse
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import equinox as eqx
@@ -24,8 +27,10 @@ from midway.envs.push import PushVectorEnv
 from midway.envs.push_scene import PushTask
 from midway.runs.folder import RunFolder, read_json
 
+VALUE = "zoo:push-state-ris"
 RESULTS = Path(__file__).parent / "results" / "features"
 LEARNED, HELD_OUT = 2_000, 500
+PAIRS, HELD_OUT_PAIRS = 50_000, 5_000
 STEPS, BATCH, RATE = 3_000, 128, 2e-3
 MOVED = 0.03
 """How far hand or puck are moved, towards the middle of where they may be (m)."""
@@ -43,30 +48,60 @@ def main() -> None:
         found = {"command": record["command"], "commit": record["commit"], **measure(run)}
         path = RESULTS / f"{folder.path.resolve().name}.json"
         path.write_text(json.dumps(found, indent=2) + "\n")
-        print(path, {name: found[name] for name in ("hand", "puck")})
+        print(path, {name: found[name] for name in ("hand", "puck", "value")})
 
 
 def measure(run: Path) -> dict[str, object]:
     """Return errors (m), and how far features move, for hand and puck."""
-    policy = midway.load(run)
-    if policy.encoder is None:
-        raise SystemExit(f"{run}: its policy has no frozen encoder")
+    encoder = encoder_of(run)
     env, rng = PushVectorEnv(), np.random.default_rng(0)
     pairs = [PushTask().sample(rng, 0.0) for _ in range(LEARNED + HELD_OUT)]
     states = np.stack([goal for _, goal in pairs])
-    seen = features(policy.encoder, env, states)
-    misses = np.abs(predicted(seen, states) - states[LEARNED:])
+    seen = features(encoder, env, states)
+    misses = np.abs(predicted(seen, states, LEARNED) - states[LEARNED:])
     values = np.linalg.svd(seen - seen.mean(0), compute_uv=False) / len(seen) ** 0.5
     return {
         "singular_values": [round(float(value), 3) for value in values],
         **{
             name: {
                 "error": round(float(np.linalg.norm(misses[:, part], axis=1).mean()), 4),
-                "moved": round(moved(policy.encoder, env, states[:HELD_OUT], part), 3),
+                "moved": round(moved(encoder, env, states[:HELD_OUT], part), 3),
             }
             for name, part in PARTS.items()
         },
+        "value": value_errors({"features": seen, "states": states}, states),
     }
+
+
+def encoder_of(run: Path) -> Encoder:
+    """Return the encoder of a run, whether it is frozen yet or not."""
+    policy = midway.load(run)
+    if policy.encoder is not None:
+        return policy.encoder
+    if policy.agent.freezing is None or not policy.spec.is_image:
+        raise SystemExit(f"{run}: reads no images")
+    found: Encoder = policy.agent.freezing.encoder(policy.state)
+    return found
+
+
+def value_errors(
+    told: Mapping[str, Float[np.ndarray, "n _"]], states: Float[np.ndarray, "n 4"]
+) -> dict[str, float]:
+    """Return root mean squared errors of the value of pairs, by what states are told by.
+
+    The value is that of a policy that reads states (minus discounted steps to the goal); beside
+    the errors is its standard deviation.
+    """
+    rng, last = np.random.default_rng(1), LEARNED + HELD_OUT
+    known = rng.integers(0, LEARNED, (PAIRS, 2))
+    pairs = np.concatenate([known, rng.integers(LEARNED, last, (HELD_OUT_PAIRS, 2))])
+    starts, goals = states.astype(np.float32)[pairs.T]
+    values = midway.load(VALUE).value(starts, goals)[:, None]
+    errors = {"spread": float(values[PAIRS:].std())}
+    for name, rows in told.items():
+        found = predicted(np.concatenate([rows[pairs[:, 0]], rows[pairs[:, 1]]], 1), values, PAIRS)
+        errors[name] = float(((found - values[PAIRS:]) ** 2).mean() ** 0.5)
+    return {name: round(error, 2) for name, error in errors.items()}
 
 
 def features(
@@ -89,12 +124,13 @@ def moved(
 
 
 def predicted(
-    seen: Float[np.ndarray, "n F"], states: Float[np.ndarray, "n 4"]
-) -> Float[np.ndarray, "m 4"]:
-    """Return what a network that learned of the first rows says of the others."""
-    inputs = jnp.asarray(standardised(seen, seen[:LEARNED]))
-    wanted = jnp.asarray(standardised(states, states[:LEARNED])[:LEARNED])
-    network = eqx.nn.MLP(seen.shape[1], 4, 256, 2, key=jax.random.key(0))
+    seen: Float[np.ndarray, "n F"], outputs: Float[np.ndarray, "n K"], learned: int
+) -> Float[np.ndarray, "m K"]:
+    """Return what a network that learned the outputs of the first rows says of the others."""
+    known = outputs[:learned]
+    inputs = jnp.asarray(standardised(seen, seen[:learned]))
+    wanted = jnp.asarray(standardised(known, known))
+    network = eqx.nn.MLP(seen.shape[1], outputs.shape[1], 256, 2, key=jax.random.key(0))
     adam = optax.adamw(optax.cosine_decay_schedule(RATE, STEPS), weight_decay=1e-3)
 
     def loss(network: eqx.nn.MLP, rows: Array) -> Array:
@@ -110,9 +146,8 @@ def predicted(
 
     state, rng = adam.init(eqx.filter(network, eqx.is_array)), np.random.default_rng(0)
     for _ in range(STEPS):
-        network, state = step(network, state, jnp.asarray(rng.integers(0, LEARNED, BATCH)))
-    known = states[:LEARNED]
-    found = np.asarray(jax.vmap(network)(inputs[LEARNED:]))
+        network, state = step(network, state, jnp.asarray(rng.integers(0, learned, BATCH)))
+    found = np.asarray(jax.vmap(network)(inputs[learned:]))
     return np.asarray(found * known.std(0) + known.mean(0))
 
 
