@@ -1,5 +1,6 @@
 """The policies that come with midway do what their cards say."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -64,5 +65,15 @@ def test_the_table_has_every_policy_with_what_its_card_says() -> None:
     rows = [line for line in (ZOO / "README.md").read_text().splitlines() if ".md)" in line]
     assert [row.split("]")[0] for row in rows] == [f"| [{name}" for name in POLICIES]
     for name, row in zip(POLICIES, rows, strict=True):
-        for found in card(name):
-            assert f"{100 * float(str(found['success_rate'])):.1f} [" in row
+        rates = {(found["task"], found["actions"]): found for found in card(name)}
+        columns = itertools.product(("hard", "uniform"), ("mean", "sampled"))
+        assert row.removesuffix(" |").split(" | ")[2:] == [
+            cell(rates[column]) for column in columns
+        ]
+
+
+def cell(found: dict[str, object]) -> str:
+    rate, interval = found["success_rate"], found["interval"]
+    assert isinstance(rate, float)
+    assert isinstance(interval, list)
+    return f"{100 * rate:.1f} [{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]"
