@@ -170,6 +170,33 @@ def test_images_of_a_moving_square_are_reconstructed(image_vae):
     assert after < 0.3 * before
 
 
+def test_images_are_standardised_by_their_mean_and_one_deviation(image_vae):
+    images = np.random.default_rng(0).integers(0, 256, (6, *IMAGE), np.uint8)
+    model = image_vae.standardised(jnp.asarray(images))
+    np.testing.assert_allclose(model.center, (images / 255).mean(0), atol=1e-6)
+    np.testing.assert_allclose(model.scale, (images / 255).var(0).mean() ** 0.5, rtol=1e-4)
+    shown = (jnp.asarray(images) / 255 - model.center) / model.scale
+    np.testing.assert_allclose(
+        encoded(model, images).mean, encoded(image_vae, shown).mean, atol=1e-4
+    )
+    latent = jax.random.normal(KEY, (2, 4))
+    expected = decoded(image_vae, latent) * model.scale + model.center
+    np.testing.assert_allclose(decoded(model, latent), expected, atol=1e-5)
+    still = image_vae.standardised(jnp.asarray(images[:1]))
+    assert np.isfinite(encoded(still, images[:1]).mean).all()
+
+
+def test_a_small_square_on_a_background_is_reconstructed(image_vae):
+    corners = [(row, column) for row in (10, 60) for column in (10, 60)]
+    images = np.full((len(corners), *IMAGE), 130, np.uint8)
+    for image, (row, column) in zip(images, corners, strict=True):
+        image[row : row + 8, column : column + 8] = 255
+    model = image_vae.standardised(jnp.asarray(images))
+    before = ((images / 255 - np.asarray(model.center)) ** 2).sum((1, 2, 3)).mean()
+    model = trained(model, jnp.asarray(images), 0.1, 150, batch=4)
+    assert reconstruction_error(model, images) < 0.5 * before
+
+
 @pytest.mark.parametrize(("kind", "size"), [("states", 5), ("pairs", 7), ("images", None)])
 def test_create_suits_the_environment(kind, size):
     model = eqx.filter_eval_shape(lambda key: vae.create(SPECS[kind], 3, (16, 8), key), KEY)

@@ -92,12 +92,17 @@ class StateVAE(eqx.Module):
 
 
 class ImageVAE(eqx.Module):
-    """Autoencoder of images ``(84, 84, 3)``; reconstructions have values around [0, 1]."""
+    """Autoencoder of images ``(84, 84, 3)``, which it standardises by ``center`` and ``scale``.
+
+    Reconstructions have values around [0, 1].
+    """
 
     encoder: tuple[Filter, ...]
     to_latent: Linear
     from_latent: Linear
     decoder: tuple[Filter, ...]
+    center: Float[Array, "84 84 3"]
+    scale: Float[Array, ""]
 
     def __init__(self, latent_size: int, *, key: Key[Array, ""]) -> None:
         keys = iter(jax.random.split(key, 4))
@@ -106,10 +111,13 @@ class ImageVAE(eqx.Module):
         self.to_latent = Linear(height * width * deepest, 2 * latent_size, "f32", key=next(keys))
         self.from_latent = Linear(latent_size, height * width * deepest, "f32", key=next(keys))
         self.decoder = _stack(deepest, DECODER_LAYERS, next(keys))
+        self.center = jnp.zeros((84, 84, 3))
+        self.scale = jnp.ones(())
 
     def encode(self, image: Shaped[Array, "B 84 84 3"]) -> Latent:
         """Return the distribution of the latent numbers of images, uint8 or in [0, 1]."""
-        x = image / 255.0 if image.dtype == jnp.uint8 else image
+        center, scale = jax.lax.stop_gradient((self.center, self.scale))
+        x = ((image / 255.0 if image.dtype == jnp.uint8 else image) - center) / scale
         for layer in self.encoder:
             x = jax.nn.relu(layer.reduce(x))
         mean, raw = jnp.split(self.to_latent(x.reshape(len(x), -1)), 2, axis=-1)
@@ -117,12 +125,13 @@ class ImageVAE(eqx.Module):
 
     def decode(self, latent: Float[Array, "B L"]) -> Float[Array, "B 84 84 3"]:
         """Return the images that the latent numbers stand for."""
+        center, scale = jax.lax.stop_gradient((self.center, self.scale))
 
         def one(latent: Float[Array, " L"]) -> Float[Array, "84 84 3"]:
             x = self.from_latent(latent[None]).reshape(1, *SMALLEST_MAP)
             for layer in self.decoder:
                 x = layer.enlarge(jax.nn.relu(x))
-            return x[0]
+            return x[0] * scale + center
 
         # In blocks that stay in the cache: half the time, of the gradient too.
         images: Float[Array, "B 84 84 3"] = jax.lax.map(one, latent, batch_size=BLOCK)
@@ -135,8 +144,15 @@ class ImageVAE(eqx.Module):
         return ((image / 255.0 - reconstruction) ** 2).sum((1, 2, 3))
 
     def standardised(self, states: Shaped[Array, "N 84 84 3"]) -> "ImageVAE":
-        """Return the autoencoder: images are not standardised."""
-        return self
+        """Return the autoencoder with the mean of these images and one deviation for all pixels.
+
+        What moves covers a few pixels, beside a background that the layers need not learn then.
+        """
+        center = states.mean(0, dtype=jnp.float32) / 255.0
+        variance = (((states / 255.0) ** 2).mean(0) - center**2).mean()
+        scale = jnp.sqrt(jnp.maximum(variance, SMALLEST_DEVIATION**2))
+        vae: ImageVAE = eqx.tree_at(lambda v: (v.center, v.scale), self, (center, scale))
+        return vae
 
 
 class LatentMean(eqx.Module):
