@@ -380,7 +380,7 @@ QUICK: tuple[Rule, ...] = (
     ),
     Rule("quick", {"relabel": HINDSIGHT_OF_LEAP}, "code of LEAP", agent="tdm leap"),
     Rule("quick", {"evaluate_every": 16_000}, "leap.md: evaluations plan", agent="leap"),
-    Rule("quick", {"evaluate_every": 160_000}, "leap.md", env="ant-*", agent="leap"),
+    Rule("quick", {"evaluate_every": 160_000}, "leap.md", env="ant-* push", agent="leap"),
     Rule("quick", {"evaluate_every": 8_000}, "leap.md", env="point-*", agent="leap"),
     Rule(
         "quick",
