@@ -63,6 +63,22 @@ def test_a_saved_policy_acts_on_images(tmp_path: Path) -> None:
     assert np.abs(actions).max() <= 1
 
 
+@needs_renderer
+def test_leap_learns_from_the_latents_of_images(tmp_path: Path) -> None:
+    """Its encoder is frozen before the first update, which donates the arrays of its state."""
+    few = {"vae_states": 100, "vae_rounds": 1, "vae_updates": 2, "vae_batch_size": 2}
+    plan = {"num_subgoals": 1, "plan_samples": 2, "plan_iterations": 1, "plan_elites": (0.5,)}
+    run = midway.train(
+        "push", agent="leap", seed=1, out=tmp_path / "run", changes=IMAGES | few | plan
+    )
+    assert run.finished
+    assert midway.evaluate(run.path, episodes=1).episodes
+    kept = midway.load(run.path)
+    image = midway.make_vec("push", num_envs=1).reset(seed=0)[0]["observation"]
+    latent = kept.state.vae.encode(jnp.asarray(image)).mean
+    np.testing.assert_array_equal(kept.encoder(jnp.asarray(image)), latent)
+
+
 def test_a_hundred_thousand_transitions_keep_each_image_once() -> None:
     held = buffer.memory_bytes(IMAGE_SPEC, capacity=102_000, num_lanes=8)
     assert held < 2.3 * 2**30

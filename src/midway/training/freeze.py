@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
+from midway import functional
 from midway.agent import AnyAgent, Encoder
 from midway.replay.storage import ReplayState
 from midway.training.devices import compile_by_lane
@@ -42,9 +43,13 @@ def encoded_replay(replay: ReplayState, encoder: Encoder) -> ReplayState:
 
 
 def keep(agent: AnyAgent, fresh: State, state: State) -> State:
-    """Return the agent created for the features with what it takes over from that of images."""
+    """Return the agent created for the features with what it takes over from that of images.
+
+    It gets arrays of its own: an update donates them, and the frozen encoder goes on with the old.
+    """
     kept = agent.freezing.kept if agent.freezing else ()
-    return cast(State, replace(cast(Any, fresh), **{name: getattr(state, name) for name in kept}))
+    taken = {name: functional.copy(getattr(state, name)) for name in kept}
+    return cast(State, replace(cast(Any, fresh), **taken))
 
 
 def thawed(env: VectorGoalEnv) -> VectorGoalEnv:
