@@ -403,6 +403,13 @@ QUICK: tuple[Rule, ...] = (
     ),
     Rule(
         "quick",
+        {"plan_samples": 150, "plan_iterations": 8, "evaluation_episodes": 20},
+        "leap.md",
+        env="push",
+        agent="leap",
+    ),
+    Rule(
+        "quick",
         {"hidden": (256, 256), "target_update_rate": 0.02},
         "leap.md",
         env="point-*",
