@@ -403,7 +403,12 @@ QUICK: tuple[Rule, ...] = (
     ),
     Rule(
         "quick",
-        {"plan_samples": 150, "plan_iterations": 8, "evaluation_episodes": 20},
+        {
+            "updates_per_step": 1.0,
+            "plan_samples": 150,
+            "plan_iterations": 8,
+            "evaluation_episodes": 20,
+        },
         "leap.md",
         env="push",
         agent="leap",
