@@ -8,6 +8,8 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from safetensors.numpy import load_file
 from small import SMALL
 
@@ -29,7 +31,13 @@ from midway.training.state import Training
 
 pytestmark = pytest.mark.usefixtures("short_episodes")
 
-FROZEN = SMALL | {"encoder_batch_size": 0, "precision": "f32", "freeze_encoder_after": 10}
+FROZEN = SMALL | {
+    "encoder_batch_size": 0,
+    "encoder_updates_per_step": 0.5,
+    "updates_per_step": 2.0,
+    "precision": "f32",
+    "freeze_encoder_after": 10,
+}
 
 
 def build(folder: Path, **changes: Any) -> Training:
@@ -197,7 +205,39 @@ def test_batches_are_smaller_only_while_images_are_encoded(
     assert buffer.create(IMAGE_SPEC.encoded(16), 204, 1).rows["observation"].shape[2:] == (16,)
 
 
-@pytest.mark.parametrize("name", ["encoder_batch_size", "freeze_encoder_after"])
+@given(
+    num_envs=st.integers(1, 20),
+    slow=st.sampled_from([0.0, 0.1, 0.25, 1 / 3, 1.0]),
+    ratio=st.sampled_from([0.25, 1.0, 1.5]),
+    updates=st.integers(1, 50),
+)
+def test_updates_follow_one_ratio_until_the_encoder_is_frozen_and_another_from_then_on(
+    num_envs: int, slow: float, ratio: float, updates: int
+) -> None:
+    config = TrainConfig(
+        num_envs=num_envs,
+        random_steps=40,
+        updates_per_step=ratio,
+        encoder_updates_per_step=slow,
+        freeze_encoder_after=updates,
+    )
+    spec, done, frozen_at, before = IMAGE_SPEC, 0, 0, slow or ratio
+    for steps in range(num_envs, 1_000, num_envs):
+        per_call = config.updates_per_call(spec.is_image)
+        while config.updates_due(steps, spec) - done >= per_call:
+            done += per_call
+        exact = max(0, steps - 40) * before
+        if not spec.is_image:
+            exact = updates + (steps - 40 - updates / before) * ratio
+        assert exact - per_call - 1e-6 < done <= max(exact + 1e-6, frozen_at)
+        if spec.is_image and done >= updates:
+            spec, frozen_at = spec.encoded(16), done
+    assert config.updates_due(500, STATE_SPEC) == int(460 * ratio)
+
+
+@pytest.mark.parametrize(
+    "name", ["encoder_batch_size", "encoder_updates_per_step", "freeze_encoder_after"]
+)
 def test_numbers_below_nothing_are_refused(name: str) -> None:
     with pytest.raises(ConfigurationError, match=f"{name} -1"):
         api.configure("push", changes={name: -1})

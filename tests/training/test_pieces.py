@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from midway import api, presets
 from midway.agents.registry import AGENTS
+from midway.envs.push import STATE_SPEC
 from midway.envs.registry import ENVIRONMENTS, make_vec
 from midway.errors import ConfigurationError
 from midway.runs.folder import RunConfig, RunFolder
@@ -34,12 +35,12 @@ def test_updates_follow_the_ratio_whatever_the_number_of_environments(
     num_envs: int, ratio: float, turns: int
 ) -> None:
     config = TrainConfig(num_envs=num_envs, updates_per_step=ratio, random_steps=40)
-    done = 0
+    done, per_call = 0, config.updates_per_call(encoding=False)
     for turn in range(1, turns + 1):
-        while config.updates_due(turn * num_envs) - done >= config.updates_per_call:
-            done += config.updates_per_call
+        while config.updates_due(turn * num_envs, STATE_SPEC) - done >= per_call:
+            done += per_call
     exact = max(0, turns * num_envs - 40) * ratio
-    assert exact - config.updates_per_call - 1e-6 < done <= exact + 1e-6
+    assert exact - per_call - 1e-6 < done <= exact + 1e-6
 
 
 @pytest.mark.parametrize("name", ["steps", "num_envs", "batch_size", "updates_per_step"])

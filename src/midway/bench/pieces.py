@@ -291,6 +291,7 @@ def filled(
         "num_envs": 8,
         "batch_size": batch,
         "encoder_batch_size": 0,
+        "encoder_updates_per_step": 0,
         "precision": precision,
         "updates_per_step": updates_per_call / 8,
         "random_steps": ROWS,

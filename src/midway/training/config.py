@@ -5,7 +5,7 @@ from fractions import Fraction
 
 from midway.errors import ConfigurationError
 from midway.settings import check, setting
-from midway.types import RelabelMix
+from midway.types import EnvSpec, RelabelMix
 
 RESTART = "restart"
 """What `TrainConfig.on_env_error` may be instead of ``stop``."""
@@ -25,6 +25,13 @@ class TrainConfig:
     )
     updates_per_step: float = setting(
         1.0, "table 1", "update-to-data ratio, kept exactly", least=1e-4, most=1_000
+    )
+    encoder_updates_per_step: float = setting(
+        0.0,
+        "not in the paper",
+        "the same while images are encoded; 0: updates_per_step",
+        least=0,
+        most=1_000,
     )
     batch_size: int = setting(2048, "table 1", "transitions", least=1, most=10**7)
     encoder_batch_size: int = setting(
@@ -82,16 +89,24 @@ class TrainConfig:
                     f"{name} {getattr(self, name)}: must be a multiple of devices {self.devices}"
                 )
 
-    @property
-    def update_ratio(self) -> Fraction:
-        """Updates per environment step as an exact fraction."""
-        return Fraction(self.updates_per_step).limit_denominator(10_000)
+    def update_ratio(self, encoding: bool) -> Fraction:
+        """Return updates per environment step as an exact fraction."""
+        ratio = (self.encoder_updates_per_step if encoding else 0) or self.updates_per_step
+        return Fraction(ratio).limit_denominator(10_000)
 
-    @property
-    def updates_per_call(self) -> int:
-        """Updates of one compiled call: those due after a step of every environment."""
-        return max(1, int(self.num_envs * self.update_ratio))
+    def updates_per_call(self, encoding: bool) -> int:
+        """Return the updates of one compiled call: those due after a step of every environment."""
+        return max(1, int(self.num_envs * self.update_ratio(encoding)))
 
-    def updates_due(self, steps: int) -> int:
-        """Return how many updates belong to this many environment steps."""
-        return int(max(0, steps - self.random_steps) * self.update_ratio)
+    def updates_due(self, steps: int, spec: EnvSpec) -> int:
+        """Return how many updates belong to this many environment steps.
+
+        Args:
+            steps: Environment steps.
+            spec: What the agent sees: of a frozen encoder's features, the updates before it was
+                frozen belong to as many steps as their own ratio asks for.
+        """
+        encoded = self.freeze_encoder_after if spec.image_shape else 0
+        before = encoded / self.update_ratio(encoding=True)
+        steps_since = max(0, steps - self.random_steps) - before
+        return int(encoded + steps_since * self.update_ratio(spec.is_image))

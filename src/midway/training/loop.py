@@ -77,14 +77,16 @@ def advance(training: Training) -> None:
     if not training.collector.moved:
         return
     steps, updates = training.counters.steps + train.num_envs, training.counters.updates
+    spec = training.program.spec
+    due, per_call = train.updates_due(steps, spec), train.updates_per_call(spec.is_image)
     stored = training.collector.stored  # updates that are due after a step without wait for one
-    while stored and train.updates_due(steps) - updates >= train.updates_per_call:
+    while stored and due - updates >= per_call:
         training.arrays, training.totals = training.program.train(
             training.arrays, training.totals, training.replay, key, updates
         )
-        updates += train.updates_per_call
+        updates += per_call
     training.counters = training.counters._replace(steps=steps, updates=updates)
-    if training.program.spec.is_image and 0 < train.freeze_encoder_after <= updates:
+    if spec.is_image and 0 < train.freeze_encoder_after <= updates:
         freeze_encoder(training)
     seconds = training.counters.training_seconds + time.perf_counter() - started
     training.counters = training.counters._replace(training_seconds=seconds)

@@ -84,7 +84,7 @@ def compile_program(
             arrays = eqx.filter(state, eqx.is_array)
             return (arrays, jax.tree.map(jnp.add, totals, metrics)), None
 
-        counts = updates + jnp.arange(config.updates_per_call)
+        counts = updates + jnp.arange(config.updates_per_call(spec.is_image))
         return jax.lax.scan(one, (arrays, totals), counts)[0]
 
     def act(
