@@ -144,7 +144,8 @@ def test_networks_are_parts_of_the_state(case):
 
 def test_update_changes_every_part_and_reports_finite_scalars(case):
     state, metrics = case.update(case.state, case.batch, KEY)
-    stateless = {"encoder", "encoder_optimizer"}  # the encoder of states has no weights
+    # The encoder of states has no weights, and without a rate no average is kept.
+    stateless = {"encoder", "encoder_optimizer", "average_policy"}
     assert changed(case.state, state) >= set(vars(state)) - {"config", "spec"} - stateless
     assert all(np.isfinite(x).all() for x in arrays(state))
     groups = {"critic", "policy"} | ({"subgoal"} if case.agent is ris.AGENT else set())

@@ -179,3 +179,25 @@ def test_learning_rates_of_each_network_halve_after_as_many_of_its_updates(agent
 
         for whole, half in zip(moved(first), moved(decaying), strict=True):
             np.testing.assert_allclose(half, whole / 2, atol=1e-7)
+
+
+def test_an_averaged_policy_follows_by_its_rate_and_acts_without_noise(pairs):
+    config = replace(pairs.state.config, policy_average_rate=0.25)
+    old = ris.create(config, pairs.spec, jax.random.key(1))
+    policy = ris.create(config, pairs.spec, jax.random.key(2)).policy
+    moved = ris.update_targets(replace(old, policy=policy))
+    networks = map(jax.tree.leaves, (old.policy, policy, moved.average_policy))
+    for before, online, after in zip(*networks, strict=True):
+        np.testing.assert_allclose(after, 0.25 * online + 0.75 * before, rtol=1e-5, atol=1e-6)
+    inputs = pairs.batch.observation, pairs.batch.goal, jax.random.key(3)
+    alone = replace(moved, policy=moved.average_policy, average_policy=None)
+    np.testing.assert_array_equal(ris.act(moved, *inputs, False), ris.act(alone, *inputs, False))
+    noisy = replace(moved, average_policy=None)
+    np.testing.assert_array_equal(ris.act(moved, *inputs, True), ris.act(noisy, *inputs, True))
+    assert (ris.act(moved, *inputs, False) != ris.act(noisy, *inputs, False)).any()
+
+
+def test_without_a_rate_there_is_no_averaged_policy(pairs):
+    assert pairs.state.config.policy_average_rate == 0
+    assert pairs.state.average_policy is None
+    assert ris.update_targets(pairs.state).average_policy is None

@@ -34,6 +34,7 @@ SMALL = {
     "log_every": 60,
     "checkpoint_every": 100,
     "steps": 400,
+    "policy_average_rate": 0.1,
 }
 SNAPSHOTS = (52, 100, 152, 200, 252, 300, 352, 400)
 TIMES = ("seconds", "training_seconds")

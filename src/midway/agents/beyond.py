@@ -51,6 +51,9 @@ class SubgoalSettings(Settings):
     subgoal_every: int = setting(
         1, "code of RIS", "updates for each of the subgoal policy", least=1
     )
+    policy_average_rate: float = setting(
+        0.0, "none", "of the policy that acts without noise; 0: no average", least=0, most=1
+    )
 
 
 @runtime_checkable

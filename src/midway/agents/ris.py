@@ -59,6 +59,7 @@ class State(eqx.Module):
     subgoal_policy: SubgoalPolicy
     policy: GaussianPolicy
     prior_policy: GaussianPolicy
+    average_policy: GaussianPolicy | None
     encoder_optimizer: optax.OptState
     critic_optimizer: optax.OptState
     subgoal_optimizer: optax.OptState
@@ -228,10 +229,13 @@ def imagine(state: State, batch: Batch, key: Key[Array, ""]) -> Subgoal:
 
 
 def update_targets(state: State) -> State:
-    """Move the target critics and the prior policy by τ (appendix B)."""
-    rate = state.config.target_update_rate
+    """Move the target critics and the prior policy by τ (appendix B), the average by its rate."""
+    rate, average = state.config.target_update_rate, state.average_policy
+    if average is not None:
+        average = functional.target_update(state.policy, average, state.config.policy_average_rate)
     return replace(
         state,
+        average_policy=average,
         target_critic=functional.target_update(state.critic, state.target_critic, rate),
         prior_policy=functional.target_update(state.policy, state.prior_policy, rate),
     )
@@ -243,8 +247,12 @@ def update_targets(state: State) -> State:
 def act(
     state: State, observation: Inputs, goal: Inputs, key: Key[Array, ""], explore: bool
 ) -> Float[Array, "B A"]:
-    """Return actions in [-1, 1] of the flat policy: sampled where ``explore``, else the mean's."""
-    return state.policy(state.encoder(observation), state.encoder(goal)).act(key, explore)
+    """Return actions in [-1, 1] of the flat policy: sampled where ``explore``, else the mean's.
+
+    The mean is that of the averaged policy, where one is kept (``policy_average_rate``).
+    """
+    policy = state.policy if explore else state.average_policy or state.policy
+    return policy(state.encoder(observation), state.encoder(goal)).act(key, explore)
 
 
 def subgoal_distribution(state: State, observation: Inputs, goal: Inputs) -> SubgoalDistribution:
@@ -277,6 +285,7 @@ def create(config: Config, spec: EnvSpec, key: Key[Array, ""]) -> State:
         subgoal_policy=subgoal_policy,
         policy=policy,
         prior_policy=functional.copy(policy),
+        average_policy=functional.copy(policy) if config.policy_average_rate else None,
         encoder_optimizer=optimizer.init(encoder),
         critic_optimizer=optimizer.init(critic),
         subgoal_optimizer=optimizer.init(subgoal_policy),
@@ -291,7 +300,7 @@ AGENT = Agent(
     create,
     update,
     act,
-    networks=("encoder", "critic", "subgoal_policy", "policy"),
+    networks=("encoder", "critic", "subgoal_policy", "policy", "average_policy"),
     value=Value(encoders.on_observations(value), "value: minus discounted steps to the goal"),
     subgoals=subgoal_distribution,
     sampling=beyond.sampling,
