@@ -1,6 +1,7 @@
 """Freezing the encoder: from then on the run is one of an ordinary agent, on features."""
 
 import csv
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -241,3 +242,10 @@ def test_updates_follow_one_ratio_until_the_encoder_is_frozen_and_another_from_t
 def test_numbers_below_nothing_are_refused(name: str) -> None:
     with pytest.raises(ConfigurationError, match=f"{name} -1"):
         api.configure("push", changes={name: -1})
+
+
+def test_a_ratio_below_one_in_ten_thousand_is_one() -> None:
+    config = TrainConfig(encoder_updates_per_step=1e-300, freeze_encoder_after=1)
+    assert config.update_ratio(encoding=True) == Fraction(1, 10_000)
+    assert config.updates_due(config.random_steps + 10_000, IMAGE_SPEC) == 1
+    assert config.updates_due(config.random_steps + 10_001, IMAGE_SPEC.encoded(16)) == 2

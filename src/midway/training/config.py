@@ -90,9 +90,9 @@ class TrainConfig:
                 )
 
     def update_ratio(self, encoding: bool) -> Fraction:
-        """Return updates per environment step as an exact fraction."""
+        """Return updates per environment step as an exact fraction, of at least 1 / 10,000."""
         ratio = (self.encoder_updates_per_step if encoding else 0) or self.updates_per_step
-        return Fraction(ratio).limit_denominator(10_000)
+        return max(Fraction(ratio).limit_denominator(10_000), Fraction(1, 10_000))
 
     def updates_per_call(self, encoding: bool) -> int:
         """Return the updates of one compiled call: those due after a step of every environment."""
