@@ -249,3 +249,9 @@ def test_a_ratio_below_one_in_ten_thousand_is_one() -> None:
     assert config.update_ratio(encoding=True) == Fraction(1, 10_000)
     assert config.updates_due(config.random_steps + 10_000, IMAGE_SPEC) == 1
     assert config.updates_due(config.random_steps + 10_001, IMAGE_SPEC.encoded(16)) == 2
+
+
+def test_a_ratio_of_an_encoder_that_never_learns_is_refused(tmp_path: Path) -> None:
+    config = api.configure("push", "leap", changes={"encoder_updates_per_step": 0.25})
+    with pytest.raises(ConfigurationError, match="frozen before the first update"):
+        state.check(api.setup_of(config, RunFolder(tmp_path)))

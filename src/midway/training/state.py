@@ -136,10 +136,17 @@ def check(setup: Setup) -> None:
 
     Raises:
         ConfigurationError: A lane of the replay is too small, the agent cannot learn from this
-            environment, the machine has fewer devices, or too little memory for replay, networks
-            and optimisers.
+            environment, its encoder of images never learns and has a ratio of updates, the machine
+            has fewer devices, or too little memory for replay, networks and optimisers.
     """
-    spec, train = setup.make_env(1, setup.train.task).goal_spec, setup.train
+    train, freezing = setup.train, setup.agent.freezing
+    spec = setup.make_env(1, train.task).goal_spec
+    never = spec.is_image and freezing is not None and freezing.at_start
+    if never and train.encoder_updates_per_step:
+        raise ConfigurationError(
+            f"encoder_updates_per_step {train.encoder_updates_per_step}: this agent's encoder is "
+            "frozen before the first update; use updates_per_step"
+        )
     replay = buffer.memory_bytes(spec, train.replay_capacity, train.num_envs)
     _devices(setup)
     key = seeds.training(setup.seed).network_key
